@@ -1,4 +1,5 @@
-"""What keeps tests and the examples in docstrings quick: few and small views, no repair, coarse rooms."""
+"""What keeps tests and the examples in docstrings quick: few and small views, no repair, coarse
+rooms."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def small_views_by_default() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def no_repair_by_default() -> Iterator[None]:
-    """``compact`` optimises for seconds unless told otherwise; here only those tests wait for it that are about it."""
+    """``compact`` optimises for seconds unless told otherwise; here only those tests wait for it
+    that are about it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(repair.STEPS, "quick", 0)
         yield
@@ -45,7 +47,8 @@ def no_repair_by_default() -> Iterator[None]:
 
 @pytest.fixture()
 def coarse_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Built-in rooms whose textures and light have few points: made in a second, for tests that do not look at them."""
+    """Built-in rooms whose textures and light have few points: made in a second, for tests that do
+    not look at them."""
     monkeypatch.setattr(light, "LIGHT", light.LightSettings(texel=0.1, lumel=0.5))
 
 

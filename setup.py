@@ -1,5 +1,5 @@
-"""Builds the library of C++ kernels (see ``pointsplat_ns/system/native.py``) where there is a compiler. All else is in
-``pyproject.toml``."""
+"""Builds the library of C++ kernels (see ``pointsplat_ns/system/native.py``) where there is a
+compiler. All else is in ``pyproject.toml``."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""What mkdocs does beyond copying docs/: pages that lie elsewhere in the repository, and docstrings as they are here.
+"""What mkdocs does beyond copying docs/: pages that lie elsewhere in the repository, and docstrings
+as they are here.
 
-A link of a page is right where it stands in the repository, so that it works on any forge as well; links to pages that
-move are turned here.
+A link of a page is right where it stands in the repository, so that it works on any forge as well;
+links to pages that move are turned here.
 """
 
 from __future__ import annotations
@@ -43,9 +44,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     source = {place: source for source, place in ELSEWHERE.items()}.get(here, f"docs/{here}")
 
     def turned(match: re.Match[str]) -> str:
-        target, anchor = match[1], match[2] or ""
+        target = match[1]
+        anchor = match[2] or ""
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
-        place = path[len("docs/") :] if path.startswith("docs/") else {**ELSEWHERE, **STANDS_FOR}.get(path)
+        place = (
+            path[len("docs/") :]
+            if path.startswith("docs/")
+            else {**ELSEWHERE, **STANDS_FOR}.get(path)
+        )
         if place is None:
             return match[0]
         return f"]({posixpath.relpath(place, posixpath.dirname(here) or '.')}{anchor})"
@@ -54,7 +60,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 class Docstrings(griffe.Extension):
-    """Reads docstrings as they are written here: ``Example:`` is code, and roles of Sphinx are names."""
+    """Reads docstrings as they are written here: ``Example:`` is code, and roles of Sphinx are
+    names."""
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         if obj.docstring is not None:

@@ -1,9 +1,10 @@
-"""Trains the feedback network across scenes: it repairs pruned scenes and maximises the PSNR that they reach.
+"""Trains the feedback network across scenes: it repairs pruned scenes and maximises the PSNR that
+they reach.
 
-An update repairs a few pruned scenes for some steps each in sampled views, and then renders them in other views. The
-mean PSNR of these renders is differentiated with respect to the network through all steps. The features of the network
-count as constants, as usual for learned optimisers (Andrychowicz et al., arXiv 1606.04474), which avoids second
-derivatives.
+An update repairs a few pruned scenes for some steps each in sampled views, and then renders them in
+other views. The mean PSNR of these renders is differentiated with respect to the network through
+all steps. The features of the network count as constants, as usual for learned optimisers
+(Andrychowicz et al., arXiv 1606.04474), which avoids second derivatives.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ class FeedbackTrainingSettings:
     view_batches: int = 3
     """Batches of views of a scene."""
     least_error: float = 1e-5
-    """Added to mean squared errors (50 dB), so that nearly correct scenes do not dominate the loss."""
+    """Added to mean squared errors (50 dB), so that nearly correct scenes do not dominate the
+    loss."""
     rate: float = 3e-3
     """Learning rate of the network's Adam; it falls like the rates of repairs."""
     rate_of_trained: float = 1e-3
@@ -79,13 +81,22 @@ class TrainingScene:
     """Renders of the dense scene, 8 bits per channel, by the index of the view."""
 
     @classmethod
-    def of(cls, name: str, dense: Gaussians, keep: Sequence[str], view_batches: int | None = None) -> TrainingScene:
+    def of(
+        cls, name: str, dense: Gaussians, keep: Sequence[str], view_batches: int | None = None
+    ) -> TrainingScene:
         """Merge a scene to each budget, and sample views of it."""
         batches = TRAINING.view_batches if view_batches is None else view_batches
-        sampled = [sample_views(dense, TRAINING.batch_views, *RESOLUTION, seed=100 + n) for n in range(batches)]
-        viewmats, Ks = (torch.cat([getattr(v, field) for v in sampled]) for field in ("viewmats", "Ks"))
+        sampled = [
+            sample_views(dense, TRAINING.batch_views, *RESOLUTION, seed=100 + n)
+            for n in range(batches)
+        ]
+        viewmats, Ks = (
+            torch.cat([getattr(v, field) for v in sampled]) for field in ("viewmats", "Ks")
+        )
         first = sampled[0]
-        views = Views(viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane)
+        views = Views(
+            viewmats, Ks, first.width, first.height, first.background, near_plane=first.near_plane
+        )
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
         reference = DenseReference(dense, middle_sized(views).spread(VIEW_COUNTS.compared))
         psnr = {budget: reference.psnr(scene)[0] for budget, scene in pruned.items()}
@@ -99,12 +110,18 @@ class TrainingScene:
     def target(self, index: int) -> Tensor:
         """Render of the dense scene in a view, (H, W, 3); drawn once."""
         if index not in self._renders:
-            self._renders[index] = _drawn(self.dense, self, index).clamp(0, 1).mul(255).round().byte()
+            self._renders[index] = (
+                _drawn(self.dense, self, index).clamp(0, 1).mul(255).round().byte()
+            )
         return self._renders[index] / 255
 
 
 def roll_out(
-    network: FeedbackRefiner, scene: TrainingScene, budget: str, steps: int, generator: random.Random
+    network: FeedbackRefiner,
+    scene: TrainingScene,
+    budget: str,
+    steps: int,
+    generator: random.Random,
 ) -> Tensor:
     """Repair a pruned scene, and measure its PSNR in views that the repair does not use.
 
@@ -116,20 +133,30 @@ def roll_out(
         generator: chooses views, and the step of the first measurement.
 
     Returns:
-        PSNR in dB: half of it from one view between a quarter and all of the steps, half from two views at the end.
+        PSNR in dB: half of it from one view between a quarter and all of the steps, half from two
+        views at the end.
     """
     chosen = generator.sample(range(len(scene.views[0])), steps + 3)
-    measured = {generator.randrange(max(1, steps // 4), steps): chosen[steps : steps + 1], steps: chosen[steps + 1 :]}
-    now, factor = scene.pruned[budget], initial_rate_factor(scene.psnr[budget])
+    measured = {
+        generator.randrange(max(1, steps // 4), steps): chosen[steps : steps + 1],
+        steps: chosen[steps + 1 :],
+    }
+    now = scene.pruned[budget]
+    factor = initial_rate_factor(scene.psnr[budget])
     feedback = Feedback(now, len(scene.dense))
     reached: list[Tensor] = []
     for step in range(steps):
         view = scene.view(chosen[step])
-        feedback.observe(gradients_of(now.detach(), view, scene.target(chosen[step]), backend=TRAINING.backend))
+        feedback.observe(
+            gradients_of(now.detach(), view, scene.target(chosen[step]), backend=TRAINING.backend)
+        )
         factors = network(feedback.features(now.detach(), step / steps, steps))
         now = feedback.moved(now, factor * rate_factor(step / steps), factors)
         if step + 1 in measured:
-            psnrs = [_decibels(_drawn(now, scene, index), scene.target(index)) for index in measured[step + 1]]
+            psnrs = [
+                _decibels(_drawn(now, scene, index), scene.target(index))
+                for index in measured[step + 1]
+            ]
             reached.append(torch.stack(psnrs).mean())
     return 0.5 * torch.stack(reached).sum()
 
@@ -146,8 +173,8 @@ def train_feedback(
 ) -> FeedbackRefiner:
     """Train a feedback network.
 
-    Connected processes (:mod:`pointsplat_ns.system.processes`) share the repairs of each update. The result is the same
-    up to rounding. Updates with gradients that are not finite are skipped.
+    Connected processes (:mod:`pointsplat_ns.system.processes`) share the repairs of each update.
+    The result is the same up to rounding. Updates with gradients that are not finite are skipped.
 
     Args:
         scenes: scenes on one device, which computes everything; the same in every process.
@@ -156,26 +183,32 @@ def train_feedback(
         seed: seed of the initial weights and of all choices.
         output: file for the network; the first process saves it at intervals and at the end.
         progress: called with the share done, in [0, 1].
-        seconds: time limit; training may end with fewer updates, and the learning rate falls with the time.
-        start: a trained network to continue from; not changed. By default training starts from a network with zero
-            steps.
+        seconds: time limit; training may end with fewer updates, and the learning rate falls with
+            the time.
+        start: a trained network to continue from; not changed. By default training starts from a
+            network with zero steps.
 
     Returns:
         The network, in evaluation mode.
 
     Raises:
-        DataError: if there is no scene, a scene has too few views for a repair, or an update has fewer repairs than
-            there are processes.
+        DataError: if there is no scene, a scene has too few views for a repair, or an update has
+            fewer repairs than there are processes.
     """
-    size, rank = processes.world_size(), processes.rank()
+    size = processes.world_size()
+    rank = processes.rank()
     if not scenes:
         raise DataError("no scene to train on; expected at least one")
     if at_once < size:
-        raise DataError(f"{at_once} repairs in an update; expected at least as many as processes, {size}")
+        raise DataError(
+            f"{at_once} repairs in an update; expected at least as many as processes, {size}"
+        )
     needed_views = max(TRAINING.steps) + 3
     for scene in scenes:
         if len(scene.views[0]) < needed_views:
-            raise DataError(f"{scene.name}: {len(scene.views[0])} views; expected at least {needed_views}")
+            raise DataError(
+                f"{scene.name}: {len(scene.views[0])} views; expected at least {needed_views}"
+            )
     generator = random.Random(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -184,11 +217,19 @@ def train_feedback(
         network.load_state_dict(start.state_dict())
     rate = TRAINING.rate if start is None else TRAINING.rate_of_trained
     adam = torch.optim.Adam(network.parameters(), lr=rate, betas=(0.9, 0.99))
-    metadata = {"scenes": [scene.name for scene in scenes], "keep": [*scenes[0].pruned], "repairs_per_update": at_once}
+    metadata = {
+        "scenes": [scene.name for scene in scenes],
+        "keep": [*scenes[0].pruned],
+        "repairs_per_update": at_once,
+    }
     began = time.monotonic()
-    saved, update, done = began, 0, 0.0
+    saved = began
+    update = 0
+    done = 0.0
     while done < 1:
-        adam.param_groups[0]["lr"] = rate * min(1, (update + 1) / TRAINING.warm_up) * rate_factor(done)
+        adam.param_groups[0]["lr"] = (
+            rate * min(1, (update + 1) / TRAINING.warm_up) * rate_factor(done)
+        )
         adam.zero_grad()
         for number in range(at_once):
             scene = generator.choice(scenes)
@@ -197,13 +238,17 @@ def train_feedback(
             own_generator = random.Random(generator.getrandbits(64))
             if number % size == rank:
                 with one_thread_each():
-                    (-roll_out(network, scene, budget, steps, own_generator) * (size / at_once)).backward()
+                    (
+                        -roll_out(network, scene, budget, steps, own_generator) * (size / at_once)
+                    ).backward()
         processes.average_gradients(network.parameters())
         if torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0).isfinite():
             adam.step()
         update += 1
         now = time.monotonic()
-        done = processes.gathered([max(update / updates, (now - began) / seconds)])[0]  # the clock of the first process
+        done = processes.gathered([max(update / updates, (now - began) / seconds)])[
+            0
+        ]  # the clock of the first process
         if output is not None and rank == 0 and (now - saved > TRAINING.save_interval or done >= 1):
             save_feedback_refiner(network, output, {**metadata, "updates": update})
             saved = now

@@ -1,9 +1,11 @@
-"""Recomputes scores, selection and encoder of a real scene in numpy, and compares them with the package's.
+"""Recomputes scores, selection and encoder of a real scene in numpy, and compares them with the
+package's.
 
     python -m lab.independent scenes/rock.ply --views 4 --width 320
 
-All above :func:`main` follows publications and file formats, and shares no code with the package. Cameras are an input:
-the package places them. Derivatives are taken by complex steps, pictures are drawn one Gaussian at a time.
+All above :func:`main` follows publications and file formats, and shares no code with the package.
+Cameras are an input: the package places them. Derivatives are taken by complex steps, pictures are
+drawn one Gaussian at a time.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ class Splats:
 
 
 class Camera(NamedTuple):
-    """A pinhole camera, OpenCV axes: world to camera (4, 4), intrinsics (3, 3), pixels, and a colour (3,)."""
+    """A pinhole camera, OpenCV axes: world to camera (4, 4), intrinsics (3, 3), pixels, and a
+    colour (3,)."""
 
     viewmat: ndarray
     K: ndarray
@@ -59,16 +62,26 @@ class Camera(NamedTuple):
 def read_ply(path: Path) -> Splats:
     """A binary PLY of floats, as 3DGS writes it."""
     header, _, data = path.read_bytes().partition(b"end_header\n")
-    names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property")]
+    names = [
+        line.split()[2] for line in header.decode().splitlines() if line.startswith("property")
+    ]
     rows = np.frombuffer(data, "<f4").reshape(-1, len(names)).astype(float)
 
     def block(start: str, *ends: object) -> ndarray:
         return rows[:, [names.index(f"{start}{end}") for end in ends]]
 
     count = sum(name.startswith("f_rest_") for name in names)
-    rest = block("f_rest_", *range(count)).reshape(len(rows), 3, count // 3).transpose(0, 2, 1)  # all of red is first
+    rest = (
+        block("f_rest_", *range(count)).reshape(len(rows), 3, count // 3).transpose(0, 2, 1)
+    )  # all of red is first
     sh = np.concatenate([block("f_dc_", 0, 1, 2)[:, None], rest], axis=1)
-    return Splats(block("", *"xyz"), block("scale_", 0, 1, 2), block("rot_", *range(4)), block("opacity", "")[:, 0], sh)
+    return Splats(
+        block("", *"xyz"),
+        block("scale_", 0, 1, 2),
+        block("rot_", *range(4)),
+        block("opacity", "")[:, 0],
+        sh,
+    )
 
 
 def paper_score(scene: Splats, weight: float = 0.3) -> ndarray:
@@ -88,30 +101,48 @@ def highest(scores: ndarray, count: int) -> ndarray:
 def harmonics(unit: ndarray, count: int) -> ndarray:
     """Real spherical harmonics (N, count) of unit vectors, as 3DGS orders and signs them."""
     x, y, z = unit.T
-    xx, yy, zz = x * x, y * y, z * z
-    c1, c2, c3 = math.sqrt(3 / math.pi) / 2, math.sqrt(15 / math.pi) / 2, math.sqrt(35 / (2 * math.pi)) / 4
-    d2, d3, e3 = math.sqrt(5 / math.pi) / 4, math.sqrt(21 / (2 * math.pi)) / 4, math.sqrt(7 / math.pi) / 4
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    c1 = math.sqrt(3 / math.pi) / 2
+    c2 = math.sqrt(15 / math.pi) / 2
+    c3 = math.sqrt(35 / (2 * math.pi)) / 4
+    d2 = math.sqrt(5 / math.pi) / 4
+    d3 = math.sqrt(21 / (2 * math.pi)) / 4
+    e3 = math.sqrt(7 / math.pi) / 4
     first = [np.full_like(x, 0.5 / math.sqrt(math.pi)), -c1 * y, c1 * z, -c1 * x]
     second = [c2 * x * y, -c2 * y * z, d2 * (2 * zz - xx - yy), -c2 * x * z, c2 / 2 * (xx - yy)]
-    third = [-c3 * y * (3 * xx - yy), 2 * math.sqrt(105 / math.pi) / 4 * x * y * z, -d3 * y * (4 * zz - xx - yy)]
+    third = [
+        -c3 * y * (3 * xx - yy),
+        2 * math.sqrt(105 / math.pi) / 4 * x * y * z,
+        -d3 * y * (4 * zz - xx - yy),
+    ]
     third += [e3 * z * (2 * zz - 3 * xx - 3 * yy), -d3 * x * (4 * zz - xx - yy)]
     third += [math.sqrt(105 / math.pi) / 4 * z * (xx - yy), -c3 * x * (xx - 3 * yy)]
     return np.stack([*first, *second, *third][:count], axis=1)
 
 
 def projected(scene: Splats, camera: Camera) -> tuple[ndarray, ndarray, ndarray]:
-    """Places (N, 2) in pixels, covariances (N, 2, 2) and colours (N, 3) in a picture (3DGS, EWA splatting)."""
-    rotation, shift = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    """Places (N, 2) in pixels, covariances (N, 2, 2) and colours (N, 3) in a picture (3DGS, EWA
+    splatting)."""
+    rotation = camera.viewmat[:3, :3]
+    shift = camera.viewmat[:3, 3]
     (fx, _, cx), (_, fy, cy), _ = camera.K
     x, y, z = (scene.means @ rotation.T + shift).T
 
-    def inside(slope: ndarray, focal: float, centre: float, size: int) -> ndarray:  # 1.3 times the field of view
-        low, high = -(centre + 0.15 * size) / focal, (size - centre + 0.15 * size) / focal
+    def inside(
+        slope: ndarray, focal: float, centre: float, size: int
+    ) -> ndarray:  # 1.3 times the field of view
+        low = -(centre + 0.15 * size) / focal
+        high = (size - centre + 0.15 * size) / focal
         return np.where(slope.real < low, low, np.where(slope.real > high, high, slope))
 
     zero = np.zeros_like(z)
-    across, down = inside(x / z, fx, cx, camera.width), inside(y / z, fy, cy, camera.height)
-    jacobian = np.stack([fx / z, zero, -fx * across / z, zero, fy / z, -fy * down / z], axis=1).reshape(-1, 2, 3)
+    across = inside(x / z, fx, cx, camera.width)
+    down = inside(y / z, fy, cy, camera.height)
+    jacobian = np.stack(
+        [fx / z, zero, -fx * across / z, zero, fy / z, -fy * down / z], axis=1
+    ).reshape(-1, 2, 3)
     quats = scene.quats / np.linalg.norm(scene.quats, axis=1, keepdims=True)
     skew = np.cross(np.eye(3), quats[:, None, 1:])
     turn = np.eye(3) + 2 * (quats[:, :1, None] * skew + skew @ skew)
@@ -120,26 +151,38 @@ def projected(scene: Splats, camera: Camera) -> tuple[ndarray, ndarray, ndarray]
     unit = away / np.sqrt((away * away).sum(axis=1, keepdims=True))
     color = 0.5 + (harmonics(unit, scene.sh.shape[1])[:, :, None] * scene.sh).sum(axis=1)
     places = np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
-    return places, half @ half.transpose(0, 2, 1) + 0.3 * np.eye(2), np.where(color.real > 0, color, 0)
+    return (
+        places,
+        half @ half.transpose(0, 2, 1) + 0.3 * np.eye(2),
+        np.where(color.real > 0, color, 0),
+    )
 
 
 class Picture:
-    """The Gaussians that a camera sees, from near to far, and the parts of its picture that they are drawn on."""
+    """The Gaussians that a camera sees, from near to far, and the parts of its picture that they
+    are drawn on."""
 
     def __init__(self, scene: Splats, camera: Camera):
         depth = scene.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
         rows = np.flatnonzero((depth >= 0.01) & (scene.opacity >= 1 / 255))
         self.ids = rows[np.argsort(depth[rows], kind="stable")]
-        self.scene, self.camera = scene[self.ids], camera
+        self.scene = scene[self.ids]
+        self.camera = camera
         self.places, self.covariances, self.colors = projected(self.scene, camera)
-        self.opacity, self.inverses = self.scene.opacity, np.linalg.inv(self.covariances)
+        self.opacity = self.scene.opacity
+        self.inverses = np.linalg.inv(self.covariances)
 
     def drawn(self) -> Iterator[tuple[int, tuple[slice, slice], ndarray, ndarray, ndarray]]:
-        """Number, part of the picture, offsets of its pixels (h, w, 2), alpha and transmittance in front (h, w) of each
-        Gaussian; alpha is 0 where it is not drawn: below 1/255, and from the one on that would finish the pixel."""
+        """Number, part of the picture, offsets of its pixels (h, w, 2), alpha and transmittance in
+        front (h, w) of each Gaussian; alpha is 0 where it is not drawn: below 1/255, and from the
+        one on that would finish the pixel."""
         size = np.array([self.camera.width, self.camera.height])
-        front, open_ = np.ones(size[::-1]), np.ones(size[::-1], bool)
-        reach = np.sqrt(2 * np.log(255 * self.opacity)[:, None] * self.covariances[:, [0, 1], [0, 1]]) + 1
+        front = np.ones(size[::-1])
+        open_ = np.ones(size[::-1], bool)
+        reach = (
+            np.sqrt(2 * np.log(255 * self.opacity)[:, None] * self.covariances[:, [0, 1], [0, 1]])
+            + 1
+        )
         low = np.clip(self.places - reach, 0, size).astype(int)
         high = np.clip(self.places + reach + 1, 0, size).astype(int)
         for i in np.flatnonzero((low < high).all(axis=1)):
@@ -159,14 +202,17 @@ class Picture:
 
 def gauss(offsets: ndarray, inverse: ndarray) -> ndarray:
     """exp(-d^T C^-1 d / 2) of offsets (h, w, 2)."""
-    x, y = offsets[..., 0], offsets[..., 1]
-    return np.exp(-0.5 * (inverse[0, 0] * x * x + 2 * inverse[0, 1] * x * y + inverse[1, 1] * y * y))
+    x = offsets[..., 0]
+    y = offsets[..., 1]
+    return np.exp(
+        -0.5 * (inverse[0, 0] * x * x + 2 * inverse[0, 1] * x * y + inverse[1, 1] * y * y)
+    )
 
 
 def lightgaussian_score(scene: Splats, cameras: list[Camera], power: float = 0.1) -> ndarray:
-    """LightGaussian's global significance (arXiv 2311.17245, eq. 3 and 4): opacity times transmittance, summed over the
-    pixels of all views that a Gaussian hits, times min(V / V90, 1)^power; V90 is the volume at 90 % of all, largest
-    first."""
+    """LightGaussian's global significance (arXiv 2311.17245, eq. 3 and 4): opacity times
+    transmittance, summed over the pixels of all views that a Gaussian hits, times min(V / V90,
+    1)^power; V90 is the volume at 90 % of all, largest first."""
     total = np.zeros(len(scene.means))
     for camera in cameras:
         picture = Picture(scene, camera)
@@ -177,8 +223,9 @@ def lightgaussian_score(scene: Splats, cameras: list[Camera], power: float = 0.1
 
 
 def pup_hessians(scene: Splats, cameras: list[Camera]) -> ndarray:
-    """Hessians (N, 6, 6) of PUP-3DGS (arXiv 2406.10219, section 3.1): sums over views, pixels and channels of the outer
-    product of a channel's gradient by mean and log-scale. The score is the logarithm of the determinant."""
+    """Hessians (N, 6, 6) of PUP-3DGS (arXiv 2406.10219, section 3.1): sums over views, pixels and
+    channels of the outer product of a channel's gradient by mean and log-scale. The score is the
+    logarithm of the determinant."""
     total = np.zeros((len(scene.means), 6, 6))
     for camera in cameras:
         picture = Picture(scene, camera)
@@ -194,15 +241,17 @@ def pup_hessians(scene: Splats, cameras: list[Camera]) -> ndarray:
             by_alpha[(alpha == 0) | (alpha >= 0.999)] = 0
             shapes = [gauss(offsets - moves[axis, i], inverses[axis, i]).imag for axis in range(6)]
             slopes = picture.opacity[i] * np.stack(shapes) / STEP  # (6, h, w)
-            slopes = slopes[..., None] * by_alpha + (alpha * front)[..., None] * colors[:, i, None, None]
+            slopes = (
+                slopes[..., None] * by_alpha + (alpha * front)[..., None] * colors[:, i, None, None]
+            )
             slopes = slopes.reshape(6, -1)
             total[picture.ids[i]] += slopes @ slopes.T
     return total
 
 
 def moved(picture: Picture, axis: int) -> tuple[ndarray, ndarray, ndarray]:
-    """Complex moves of places and complex inverse covariances, for a complex step of all Gaussians along one of mean
-    (0 to 2) and log-scale (3 to 5); and the derivatives of their colours."""
+    """Complex moves of places and complex inverse covariances, for a complex step of all Gaussians
+    along one of mean (0 to 2) and log-scale (3 to 5); and the derivatives of their colours."""
     step = 1j * STEP * (np.arange(6) == axis)
     scene = Splats(**vars(picture.scene) | {"means": picture.scene.means + step[:3]})
     scene.log_scales = scene.log_scales + step[3:]
@@ -211,7 +260,8 @@ def moved(picture: Picture, axis: int) -> tuple[ndarray, ndarray, ndarray]:
 
 
 def log_determinants(blocks: ndarray) -> tuple[ndarray, ndarray]:
-    """Logarithms of determinants (N,), and the least eigenvalues (N,) of the blocks with a diagonal of ones."""
+    """Logarithms of determinants (N,), and the least eigenvalues (N,) of the blocks with a diagonal
+    of ones."""
     diagonal = blocks.diagonal(axis1=1, axis2=2)
     root = np.sqrt(np.where(diagonal > 0, diagonal, 1))
     unit = blocks / root[:, :, None] / root[:, None]
@@ -235,13 +285,16 @@ def read_safetensors(path: Path) -> tuple[dict[str, ndarray], dict]:
 
 
 def encoder_inputs(scene: Splats, config: dict) -> dict[str, ndarray]:
-    """Inputs of the encoder: places in the unit cube, whose outermost 1 % of places count as outliers; unit quaternions
-    of one sign; log-scales and logits brought to order 1; harmonics."""
-    ordered, n = np.sort(scene.means, axis=0), len(scene.means)
+    """Inputs of the encoder: places in the unit cube, whose outermost 1 % of places count as
+    outliers; unit quaternions of one sign; log-scales and logits brought to order 1; harmonics."""
+    ordered = np.sort(scene.means, axis=0)
+    n = len(scene.means)
     trim = max(1, math.ceil(0.01 * n)) if n >= 8 else 0
-    low, high = ordered[trim], ordered[n - 1 - trim]
+    low = ordered[trim]
+    high = ordered[n - 1 - trim]
     reach = 0.5 * (high - low).max()
-    low, high = np.maximum(ordered[0], low - reach), np.minimum(ordered[-1], high + reach)
+    low = np.maximum(ordered[0], low - reach)
+    high = np.minimum(ordered[-1], high + reach)
     extent = (high - low).max()
     centre, spread, logits = (0, 1, 1) if config.get("raw_inputs") else (-5, 2, 4)
     quats = scene.quats / np.linalg.norm(scene.quats, axis=1, keepdims=True)
@@ -253,12 +306,15 @@ def encoder_inputs(scene: Splats, config: dict) -> dict[str, ndarray]:
         "scales": ((scene.log_scales - math.log(extent)).clip(-17, 7) - centre) / spread,
         "opacities": scene.logits[:, None].clip(-12, 12) / logits,
         "features_dc": scene.sh[:, 0].clip(-8, 8),
-        "features_rest": np.pad(rest, ((0, 0), (0, 3 * ((config["sh_degree"] + 1) ** 2 - 1) - rest.shape[1]))),
+        "features_rest": np.pad(
+            rest, ((0, 0), (0, 3 * ((config["sh_degree"] + 1) ** 2 - 1) - rest.shape[1]))
+        ),
     }
 
 
 def encoded(inputs: dict[str, ndarray], tensors: dict[str, ndarray], config: dict) -> ndarray:
-    """The dual-branch encoder (PointSplat's eq. 4 to 6): softmax(phi_a + delta) * (phi_p + delta)."""
+    """The dual-branch encoder (PointSplat's eq. 4 to 6): softmax(phi_a + delta) * (phi_p +
+    delta)."""
 
     def layers(branch: str, x: ndarray) -> ndarray:
         for number in range(4):
@@ -277,15 +333,24 @@ def encoded(inputs: dict[str, ndarray], tensors: dict[str, ndarray], config: dic
 
     color = layers("color", inputs["features_rest"])
     delta = layers("position", inputs["positions"])
-    gate = layers("appearance", np.hstack([inputs["opacities"], inputs["features_dc"], color])) + delta
+    gate = (
+        layers("appearance", np.hstack([inputs["opacities"], inputs["features_dc"], color])) + delta
+    )
     gate = np.exp(gate - gate.max(axis=1, keepdims=True))
     gate /= gate.sum(axis=1, keepdims=True)
-    geometry = layers("geometry", np.hstack([inputs["positions"], inputs["quats"], inputs["scales"]])) + delta
+    geometry = (
+        layers("geometry", np.hstack([inputs["positions"], inputs["quats"], inputs["scales"]]))
+        + delta
+    )
     return gate * geometry * (geometry.shape[1] if config.get("unit_gate") else 1)
 
 
 def main(
-    scene: tyro.conf.Positional[Path], views: int = 4, width: int = 320, keep: float = 0.1, refiner: Path | None = None
+    scene: tyro.conf.Positional[Path],
+    views: int = 4,
+    width: int = 320,
+    keep: float = 0.1,
+    refiner: Path | None = None,
 ) -> list[list[str]]:
     """Print how far the package's results in float64 are from those recomputed here.
 
@@ -311,14 +376,24 @@ def main(
         if path != scene:
             ps.save(loaded, path)
         mine = read_ply(path)
-    theirs, looks = loaded.to(torch.float64), ps.sample_views(loaded, views, width, 3 * width // 4)
-    viewmats, Ks, background = (value.double().numpy() for value in (looks.viewmats, looks.Ks, looks.background))
-    cameras = [Camera(view, K, looks.width, looks.height, background) for view, K in zip(viewmats, Ks, strict=True)]
+    theirs = loaded.to(torch.float64)
+    looks = ps.sample_views(loaded, views, width, 3 * width // 4)
+    viewmats, Ks, background = (
+        value.double().numpy() for value in (looks.viewmats, looks.Ks, looks.background)
+    )
+    cameras = [
+        Camera(view, K, looks.width, looks.height, background)
+        for view, K in zip(viewmats, Ks, strict=True)
+    ]
     lines: list[list[str]] = []
 
     def compare(what: str, own: ndarray, package: torch.Tensor, ranks: bool = False) -> None:
         off = np.abs(own - package.numpy()) / np.maximum(np.abs(own), 1e-3 * np.abs(own).max())
-        theirs = [select(package, round(share * len(own))).numpy() for share in (0.5, 0.3, 0.1)] if ranks else []
+        theirs = (
+            [select(package, round(share * len(own))).numpy() for share in (0.5, 0.3, 0.1)]
+            if ranks
+            else []
+        )
         same = [len(np.intersect1d(highest(own, len(rows)), rows)) / len(rows) for rows in theirs]
         found = ", ".join(f"{100 * share:.5g}" for share in same) or "-"
         lines.append([what, f"{len(own):,}", f"{np.median(off):.0e}", f"{off.max():.0e}", found])
@@ -326,7 +401,9 @@ def main(
     score = paper_score(mine)
     compare("paper's score, eq. 3", score, paper.paper_score(theirs), ranks=True)
     light = lightgaussian_score(mine, cameras)
-    compare("LightGaussian's score", light, view_scores.lightgaussian_score(theirs, looks), ranks=True)
+    compare(
+        "LightGaussian's score", light, view_scores.lightgaussian_score(theirs, looks), ranks=True
+    )
     blocks = pup_hessians(mine, cameras)
     compare("PUP-3DGS: Hessians", blocks, view_scores.sensitivity(theirs, looks))
     sensitivities, least = log_determinants(blocks)
@@ -335,16 +412,30 @@ def main(
     compare("PUP-3DGS's score, where determined", sensitivities[clear], pup, ranks=True)
 
     weights = refiner or SHIPPED_REFINER
-    (tensors, config), network = read_safetensors(weights), read_refiner(weights).double()
+    (tensors, config) = read_safetensors(weights)
+    network = read_refiner(weights).double()
     kept = highest(score, round(keep * len(score)))
-    small, settings = theirs[torch.from_numpy(kept)], network.config
+    small = theirs[torch.from_numpy(kept)]
+    settings = network.config
     cube = unit_cube(small.means)
-    features = gaussian_features(small, cube, settings.num_rest, torch.float64, raw=settings.raw_inputs)
+    features = gaussian_features(
+        small, cube, settings.num_rest, torch.float64, raw=settings.raw_inputs
+    )
     inputs = encoder_inputs(mine[kept], config)
     for name, values in inputs.items():
         compare(f"encoder's input {name}", values, getattr(features, name))
-    compare("dual-branch encoder's output", encoded(inputs, tensors, config), network.encoder(features).detach())
-    heads = ("recomputed", "number", "relative difference: median", "largest", "% the same of the best 50, 30, 10 %")
+    compare(
+        "dual-branch encoder's output",
+        encoded(inputs, tensors, config),
+        network.encoder(features).detach(),
+    )
+    heads = (
+        "recomputed",
+        "number",
+        "relative difference: median",
+        "largest",
+        "% the same of the best 50, 30, 10 %",
+    )
     print(markdown(heads, lines))
     return lines
 

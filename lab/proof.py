@@ -1,4 +1,5 @@
-"""Goes the ways of users, and checks that every screen, page, picture and JSON says the same of one file."""
+"""Goes the ways of users, and checks that every screen, page, picture and JSON says the same of one
+file."""
 
 from __future__ import annotations
 
@@ -50,7 +51,10 @@ class Proof:
         said = done.stdout if "--json" in command else done.stdout + done.stderr
         if "--json" not in command:
             print(said, end="", flush=True)
-        self.check(done.returncode == 0, f"{shlex.join(command)} ends with {done.returncode}: {done.stderr[-300:]}")
+        self.check(
+            done.returncode == 0,
+            f"{shlex.join(command)} ends with {done.returncode}: {done.stderr[-300:]}",
+        )
         self.words(said if "--json" not in command else "", shlex.join(command))
         return said
 
@@ -65,7 +69,9 @@ class Proof:
 
     def page(self, name: str) -> str:
         """The text that a page shows."""
-        text = re.sub(r"(?s)<(script|style).*?</\1>|<[^>]*>", " ", (self.folder / name).read_text("utf-8"))
+        text = re.sub(
+            r"(?s)<(script|style).*?</\1>|<[^>]*>", " ", (self.folder / name).read_text("utf-8")
+        )
         self.words(unescape(text), name)
         return " ".join(unescape(text).split())
 
@@ -84,35 +90,57 @@ def downloaded(proof: Proof, scene: Path) -> None:
     files = {"-o": f"{name}.sog", "--html": f"{name}.html", "--picture": f"{name}.png"}
     options = [word for pair in files.items() for word in pair]
     line = proof.written(
-        proof.run("compact", scene, "--keep", "10%", "--effort", "instant", *options, "--force"), files["-o"]
+        proof.run("compact", scene, "--keep", "10%", "--effort", "instant", *options, "--force"),
+        files["-o"],
     )
-    alone = proof.written(proof.run("prune", scene, "--keep", "10%", "-o", files["-o"], "--force"), files["-o"])
+    alone = proof.written(
+        proof.run("prune", scene, "--keep", "10%", "-o", files["-o"], "--force"), files["-o"]
+    )
     proof.check(line == alone, f"compact without a repair says {line!r}, prune {alone!r}")
     proof.check(line in proof.page(files["--html"]), f"{files['--html']} lacks {line!r}")
     titles = Image.open(proof.folder / files["--picture"]).text["Description"]
-    proof.check(all(part in titles for part in line.split(": ")), f"{files['--picture']} lacks {line!r}: {titles!r}")
+    proof.check(
+        all(part in titles for part in line.split(": ")),
+        f"{files['--picture']} lacks {line!r}: {titles!r}",
+    )
     sizes = [bytes_text(path.stat().st_size) for path in (scene, proof.folder / files["-o"])]
-    proof.check(all(size in titles for size in sizes), f"{files['--picture']} lacks a size of {sizes}: {titles!r}")
-    text = (proof.folder / files["--html"]).read_text("utf-8")  # names of scenes are in the page's data
+    proof.check(
+        all(size in titles for size in sizes),
+        f"{files['--picture']} lacks a size of {sizes}: {titles!r}",
+    )
+    text = (proof.folder / files["--html"]).read_text(
+        "utf-8"
+    )  # names of scenes are in the page's data
     proof.check(all(size in text for size in sizes), f"{files['--html']} lacks a size of {sizes}")
-    found, about = proof.json("prune", scene, "--keep", "10%", "-o", files["-o"]), proof.json("info", scene)
+    found = proof.json("prune", scene, "--keep", "10%", "-o", files["-o"])
+    about = proof.json("info", scene)
     proof.check(found["quality"] == line, f"the JSON of prune says {found['quality']!r}")
-    proof.check(found["bytes"] == (proof.folder / files["-o"]).stat().st_size, "the JSON has another size")
+    proof.check(
+        found["bytes"] == (proof.folder / files["-o"]).stat().st_size, "the JSON has another size"
+    )
     proof.check(about["bytes"] == scene.stat().st_size, "info says another size")
     if found["origin"].startswith("sampled"):
-        proof.check(abs(about["fill"] - found["fill_before"]) < 0.05, f"fill {about['fill']}, {found['fill_before']}")
+        proof.check(
+            abs(about["fill"] - found["fill_before"]) < 0.05,
+            f"fill {about['fill']}, {found['fill_before']}",
+        )
 
 
 def measured(proof: Proof, scene: Path) -> None:
-    """The way of somebody who writes a paper: levels and a sweep agree with the commands for one scene."""
+    """The way of somebody who writes a paper: levels and a sweep agree with the commands for one
+    scene."""
     name = scene.name.partition(".")[0]
-    line = proof.written(proof.run("prune", scene, "--keep", "10%", "-o", f"{name}.ply", "--force"), f"{name}.ply")
+    line = proof.written(
+        proof.run("prune", scene, "--keep", "10%", "-o", f"{name}.ply", "--force"), f"{name}.ply"
+    )
     figures = line.partition(":")[0]
     proof.run("lod", scene, "--levels", "10%", "-o", f"{name}_lod", "--force")
     level = json.loads((proof.folder / f"{name}_lod" / "lod.json").read_text("utf-8"))["levels"][0]
     proof.check(level["quality"] == line, f"lod says {level['quality']!r}, prune {line!r}")
     folder = f"{name}_tradeoff"
-    said = proof.run("tradeoff", scene, "--keep", "10%", "--repairs", "none", "-o", folder, "--force")
+    said = proof.run(
+        "tradeoff", scene, "--keep", "10%", "--repairs", "none", "-o", folder, "--force"
+    )
     sweep = json.loads((proof.folder / folder / "tradeoff.json").read_text("utf-8"))
     point = sweep["points"][1]["against_dense"]
     found = f"{point['psnr']:.1f} dB, SSIM {point['ssim']:.2f}"
@@ -126,7 +154,18 @@ def measured(proof: Proof, scene: Path) -> None:
 def captured(proof: Proof, run: Path, data: Path | None) -> None:
     """The way of somebody with a capture: photos lead, on the screen and on the page."""
     where = [] if data is None else ["--data", data]
-    options = ["--keep", "10%", "--photos", "--seconds", "60", *where, "-o", "photos.ply", "--html", "photos.html"]
+    options = [
+        "--keep",
+        "10%",
+        "--photos",
+        "--seconds",
+        "60",
+        *where,
+        "-o",
+        "photos.ply",
+        "--html",
+        "photos.html",
+    ]
     line = proof.written(proof.run("compact", run, *options, "--force"), "photos.ply")
     proof.check(
         re.match(r"[\d.]+ (?:-> [\d.]+ )?dB in \d+ .*photos", line) is not None,

@@ -1,7 +1,7 @@
 """Dataparsers that this plugin adds to nerfstudio.
 
-Apart from the methods: nerfstudio loads dataparsers while the modules that methods need are half imported, and before
-what raises its warnings.
+Apart from the methods: nerfstudio loads dataparsers while the modules that methods need are half
+imported, and before what raises its warnings.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ def _scannetpp() -> DataParserSpecification:
 
     return DataParserSpecification(
         config=SeededScanNetppDataParserConfig(),
-        description="ScanNet++ without frames marked as bad, and with COLMAP's points to start from.",
+        description=(
+            "ScanNet++ without frames marked as bad, and with COLMAP's points to start from."
+        ),
     )
 
 

@@ -15,7 +15,10 @@ def _splatfacto_cpu() -> MethodSpecification:
     errors_in_one_line()
     return MethodSpecification(
         config=splatfacto_cpu_config(),
-        description="Splatfacto with a rasterizer in plain torch: trains on a CPU, and on CUDA where there is one.",
+        description=(
+            "Splatfacto with a rasterizer in plain torch: trains on a CPU, and on CUDA where "
+            "there is one."
+        ),
     )
 
 
@@ -27,7 +30,10 @@ def _pointsplat() -> MethodSpecification:
 
     return MethodSpecification(
         config=pointsplat_config(),
-        description="Prunes trained Splatfacto scenes and repairs them with one network trained across scenes.",
+        description=(
+            "Prunes trained Splatfacto scenes and repairs them with one network trained across "
+            "scenes."
+        ),
     )
 
 
@@ -51,7 +57,10 @@ def _pointsplat_authors() -> MethodSpecification:
 
     return MethodSpecification(
         config=authors_config(),
-        description="pointsplat with the settings of the code that the paper's authors released; needs a GPU.",
+        description=(
+            "pointsplat with the settings of the code that the paper's authors released; needs a "
+            "GPU."
+        ),
     )
 
 

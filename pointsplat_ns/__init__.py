@@ -9,8 +9,8 @@
 >>> bool(ps.psnr(image, ps.render(scene, views[0])) > 15)
 True
 
-The names below are the whole public API. They are imported when they are first used: ``import pointsplat_ns`` costs
-nothing.
+The names below are the whole public API. They are imported when they are first used: ``import
+pointsplat_ns`` costs nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ import importlib
 
 __version__ = "0.1.0"
 
-TYPE_CHECKING = False  # as type checkers read it; to import typing takes longer than all the rest here
+TYPE_CHECKING = (
+    False  # as type checkers read it; to import typing takes longer than all the rest here
+)
 if TYPE_CHECKING:
     from typing import Any
 
@@ -28,7 +30,13 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.pictures import plot_comparison
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
-    from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
+    from pointsplat_ns.errors import (
+        BudgetError,
+        DataError,
+        MissingPackageError,
+        PointSplatError,
+        SceneError,
+    )
     from pointsplat_ns.filming import open_viewer, render_path
     from pointsplat_ns.folders import SceneResult, compact_folder
     from pointsplat_ns.gaussians import Gaussians
@@ -57,7 +65,13 @@ _PUBLIC = {
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),
     "pointsplat_ns.pages.scene_page": ("write_page",),
     "pointsplat_ns.looking.sampling": ("sample_views",),
-    "pointsplat_ns.errors": ("BudgetError", "DataError", "MissingPackageError", "PointSplatError", "SceneError"),
+    "pointsplat_ns.errors": (
+        "BudgetError",
+        "DataError",
+        "MissingPackageError",
+        "PointSplatError",
+        "SceneError",
+    ),
     "pointsplat_ns.folders": ("SceneResult", "compact_folder"),
     "pointsplat_ns.gaussians": ("Gaussians",),
     "pointsplat_ns.io.scene": ("save",),
@@ -75,12 +89,46 @@ _PUBLIC = {
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}
 
 __all__ = [
-    "BudgetError", "Compacted", "DataError", "Gaussians", "Levels", "MissingPackageError", "PointSplatError",
-    "SceneError", "SceneInfo", "SceneResult", "Tradeoff", "TrainedRefiner", "View", "Views", "clean", "compact",
-    "compact_folder", "dataset_views", "example_room", "info", "load", "load_refiner", "lod", "lpips",
-    "measure_tradeoff", "open_viewer", "place", "plot_comparison", "plot_views", "prune",
-    "psnr", "rasterization", "refine", "render", "render_path", "sample_views", "save", "ssim", "write_page",
-]  # fmt: skip
+    "BudgetError",
+    "Compacted",
+    "DataError",
+    "Gaussians",
+    "Levels",
+    "MissingPackageError",
+    "PointSplatError",
+    "SceneError",
+    "SceneInfo",
+    "SceneResult",
+    "Tradeoff",
+    "TrainedRefiner",
+    "View",
+    "Views",
+    "clean",
+    "compact",
+    "compact_folder",
+    "dataset_views",
+    "example_room",
+    "info",
+    "load",
+    "load_refiner",
+    "lod",
+    "lpips",
+    "measure_tradeoff",
+    "open_viewer",
+    "place",
+    "plot_comparison",
+    "plot_views",
+    "prune",
+    "psnr",
+    "rasterization",
+    "refine",
+    "render",
+    "render_path",
+    "sample_views",
+    "save",
+    "ssim",
+    "write_page",
+]
 
 
 def __getattr__(name: str) -> Any:

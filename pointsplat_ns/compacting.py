@@ -32,20 +32,20 @@ Source = Gaussians | str | Path
 
 @dataclass(frozen=True, eq=False)
 class Looking:
-    """Options on views, as arguments of :func:`pointsplat_ns.prune`. Raises PointSplatError if the resolution or ``up``
-    is not valid."""
+    """Options on views, as arguments of :func:`pointsplat_ns.prune`. Raises PointSplatError if the
+    resolution or ``up`` is not valid."""
 
     views: Views | str | Path | None = None
-    """Views, the run whose dataset has the poses, a file of cameras, None for those of the scene's run or of a file of
-    cameras that lies beside the scene, or "none" for sampled ones."""
+    """Views, the run whose dataset has the poses, a file of cameras, None for those of the scene's
+    run or of a file of cameras that lies beside the scene, or "none" for sampled ones."""
     resolution: tuple[int, int] | str | None = None
     """Width and height of pictures, pixels."""
     up: str | None = None
     data: str | Path | None = None
     """Where the data of a run is now, if it moved: the data itself, or a folder above it."""
     photos: Path | str | bool = False
-    """Whether to read the photos of the scene's run; or a folder of photos, whose poses are those of ``views``, a file,
-    or are looked for if that is None."""
+    """Whether to read the photos of the scene's run; or a folder of photos, whose poses are those
+    of ``views``, a file, or are looked for if that is None."""
     size: tuple[int, int] | None = field(init=False)
     """``resolution``, parsed."""
     upward: Up | None = field(init=False)
@@ -68,7 +68,8 @@ def prune_source(
     """Read a scene and prune it; notes are logged as details.
 
     Returns:
-        The dense scene, the smaller scene, the seconds of pruning, and the source of its views, to judge it in.
+        The dense scene, the smaller scene, the seconds of pruning, and the source of its views, to
+        judge it in.
     """
     from pointsplat_ns.compression.prune import prune_scene
 
@@ -94,19 +95,22 @@ def clean(
     data: str | Path | None = None,
     progress: bool | Progress = False,
 ) -> Gaussians:
-    """Remove floaters from a scene, and what cannot be drawn or is seen from nowhere. No photos are needed.
+    """Remove floaters from a scene, and what cannot be drawn or is seen from nowhere. No photos are
+    needed.
 
     Findings (counts, clusters, PSNR without what goes) are logged at level INFO.
 
     Args:
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
-        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
-            hardly change. 0 removes none.
-        picture: a PNG file to write: the scene, what goes in a colour for each cluster, and the result.
+        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show,
+            without which pictures hardly change. 0 removes none.
+        picture: a PNG file to write: the scene, what goes in a colour for each cluster, and the
+            result.
         views, resolution, up, data, progress: as for :func:`pointsplat_ns.prune`.
 
     Returns:
-        The other Gaussians, bit for bit and in order, at least one, on the device of the given scene.
+        The other Gaussians, bit for bit and in order, at least one, on the device of the given
+        scene.
 
     Raises:
         SceneError: if no Gaussian can be drawn, or a file is not usable.
@@ -171,18 +175,21 @@ def compact_source(
             result = compact_scene(dense, request, source, report, photos.training)
     _log_details((*result.notes, *result.verdict.splitlines()), source)
     log(tuple(filter(None, [result.target])))
-    trained = next((place for place, stage in enumerate(result.stages) if stage.photos is not None), None)
+    trained = next(
+        (place for place, stage in enumerate(result.stages) if stage.photos is not None), None
+    )
     _log_held_out(dense, (last_kept(result.stages[:trained]).scene, result.scene), photos)
     return dense, result, source
 
 
 def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]:
-    """Read the dense scene, and make its source of views. Raises SceneError if a file is missing or damaged, or the
-    scene is a ``pointsplat`` run, which is pruned already; and DataError if a file of cameras is not usable, or most of
-    them see nothing of the scene."""
+    """Read the dense scene, and make its source of views. Raises SceneError if a file is missing or
+    damaged, or the scene is a ``pointsplat`` run, which is pruned already; and DataError if a file
+    of cameras is not usable, or most of them see nothing of the scene."""
     from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_source
 
-    views, data = looking.views, looking.data
+    views = looking.views
+    data = looking.data
     if data is not None:
         need_named_data(scene if views is None or without_poses(views) else views, data)
     poses: Path | str | None = None if views is None else NO_POSES
@@ -191,13 +198,15 @@ def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]
 
         if not Path(views).exists():
             raise SceneError(
-                f"{views}: no such file or folder; expected views, a run whose dataset has the poses, or a file of "
-                "cameras"
+                f"{views}: no such file or folder; expected views, a run whose dataset has the "
+                "poses, or a file of cameras"
             )
         poses = views if is_camera_file(views) else NO_POSES
     dense, found, _ = read_found(scene, poses)
     given = views if isinstance(views, Views) else found
-    return dense, view_source(dense, given, looking.run_of(scene), data, looking.size, looking.upward)
+    return dense, view_source(
+        dense, given, looking.run_of(scene), data, looking.size, looking.upward
+    )
 
 
 class _Photos(NamedTuple):
@@ -210,9 +219,10 @@ class _Photos(NamedTuple):
 def _read_photographed(
     scene: Source, looking: Looking, progress: bool | Progress, training: bool = True
 ) -> tuple[Gaussians, ViewSource, _Photos]:
-    """The dense scene, its views and its photos; those to train on only with ``training``. Errors are those of
-    :func:`read_source`, and of :func:`~pointsplat_ns.photos.posed_photos.read_with_photos`; or a SceneError if the
-    photos of a run are wanted and there is no run, a DataError if its data is not found or unlike the scene."""
+    """The dense scene, its views and its photos; those to train on only with ``training``. Errors
+    are those of :func:`read_source`, and of
+    :func:`~pointsplat_ns.photos.posed_photos.read_with_photos`; or a SceneError if the photos of a
+    run are wanted and there is no run, a DataError if its data is not found or unlike the scene."""
     if looking.photos is False:
         return *read_source(scene, looking), _Photos()
     if not isinstance(looking.photos, bool):
@@ -220,13 +230,20 @@ def _read_photographed(
 
         with progress_bar(progress) as report:
             dense, posed = read_with_photos(
-                scene, Path(looking.photos), looking.views, looking.data, looking.size, report, training
+                scene,
+                Path(looking.photos),
+                looking.views,
+                looking.data,
+                looking.size,
+                report,
+                training,
             )
         source = ViewSource(dense, posed.views, resolution=looking.size, up=looking.upward)
         return dense, source, _Photos(posed.training, posed.held_out)
     if isinstance(scene, Gaussians):
         raise SceneError(
-            "photos are read from the dataset of a run; expected the path of a run, or the folder of the photos"
+            "photos are read from the dataset of a run; expected the path of a run, or the folder "
+            "of the photos"
         )
     from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 
@@ -259,4 +276,6 @@ def log(lines: tuple[str, ...]) -> None:
 def _log_details(lines: tuple[str, ...], source: ViewSource) -> None:
     """Log lines of text at level DEBUG, but at level INFO that the poses of a run are not found."""
     for line in lines:
-        logger.log(logging.INFO if source.missing and line == source.text else logging.DEBUG, "%s", line)
+        logger.log(
+            logging.INFO if source.missing and line == source.text else logging.DEBUG, "%s", line
+        )

@@ -1,8 +1,8 @@
 """Errors that a user can act on.
 
-Everything that can be wrong with a file, a folder or a flag raises a subclass of :class:`PointSplatError`. Its text is
-one line that names the file, what was found, what was expected and what to do. The command line prints that line and
-exits with status 1.
+Everything that can be wrong with a file, a folder or a flag raises a subclass of
+:class:`PointSplatError`. Its text is one line that names the file, what was found, what was
+expected and what to do. The command line prints that line and exits with status 1.
 """
 
 from __future__ import annotations
@@ -12,14 +12,16 @@ from typing import Literal
 
 
 def printable(text: str) -> str:
-    r"""Text in one line that cannot steer a terminal: every character that is not printable becomes its escape, as in
-    Python's ``repr``.
+    r"""Text in one line that cannot steer a terminal: every character that is not printable becomes
+    its escape, as in Python's ``repr``.
 
     Example:
         >>> print(printable("a name\x1b]0;with orders\x07\n"))
         a name\x1b]0;with orders\x07\n
     """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
+    )
 
 
 class PointSplatError(Exception):
@@ -31,12 +33,14 @@ class PointSplatError(Exception):
         ...     ps.prune(ps.example_room(), by="magic")
         ... except ps.PointSplatError as error:
         ...     print(error)
-        no method is called 'magic'; expected one of merge, coverage, paper, authors, opacity, random, \
+        no method is called 'magic'; expected one of merge, coverage, paper, authors, opacity,
+        random, \
 lightgaussian, pup
     """
 
     def __str__(self) -> str:
-        """The text in one line: what a file put into it can neither break the line nor steer a terminal."""
+        """The text in one line: what a file put into it can neither break the line nor steer a
+        terminal."""
         return printable(super().__str__())
 
 
@@ -49,8 +53,10 @@ class SceneError(PointSplatError):
         ...     ps.load("nowhere.ply")
         ... except ps.SceneError as error:
         ...     print(error)
-        nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog, lod-meta.json, meta.json, \
-.splat), a checkpoint of Splatfacto or gsplat (.ckpt, .pt), or a Splatfacto run (its folder or config.yml)
+        nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog,
+        lod-meta.json, meta.json, \
+.splat), a checkpoint of Splatfacto or gsplat (.ckpt, .pt), or a Splatfacto run (its folder or
+config.yml)
     """
 
 
@@ -92,7 +98,8 @@ class MissingPackageError(PointSplatError):
 
 
 def need(package: Literal["nerfstudio"], what: str) -> None:
-    """Raise a MissingPackageError, which says ``what`` needs a package, if it cannot be imported."""
+    """Raise a MissingPackageError, which says ``what`` needs a package, if it cannot be
+    imported."""
     try:
         importlib.import_module(package)
     except ModuleNotFoundError as error:
@@ -100,4 +107,6 @@ def need(package: Literal["nerfstudio"], what: str) -> None:
             raise
         # pip adds what an installed package asks for and lacks.
         remedy = f"pip install 'pointsplat-ns[{package}]' adds it"
-        raise MissingPackageError(f"{what} needs {package}, which is not installed; {remedy}") from None
+        raise MissingPackageError(
+            f"{what} needs {package}, which is not installed; {remedy}"
+        ) from None

@@ -45,24 +45,27 @@ def render_path(
 ) -> int:
     """Film a scene, or two scenes side by side with the same cameras.
 
-    The film goes exactly through the views or the poses of the run's dataset; without these around an object, or past
-    what shows most of a room.
+    The film goes exactly through the views or the poses of the run's dataset; without these around
+    an object, or past what shows most of a room.
 
     Args:
         scene: N Gaussians, or the path of a scene.
-        output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame alone. It appears
-            when it is complete.
-        other: a second scene in the same frame, to compare with. Both are labelled with their names and counts.
-        views: views to go through, in place of the dataset's poses: views, or a file of cameras (``cameras.json`` of
-            3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model).
-        up: the axis that is up in the scene ("z", "-y") for a film without views; by default the scene's own, or
-            estimated.
-        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
+        output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame
+            alone. It appears when it is complete.
+        other: a second scene in the same frame, to compare with. Both are labelled with their names
+            and counts.
+        views: views to go through, in place of the dataset's poses: views, or a file of cameras
+            (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP
+            model).
+        up: the axis that is up in the scene ("z", "-y") for a film without views; by default the
+            scene's own, or estimated.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the
+            run says.
         width: width of one scene's picture, pixels; by default that of the photos, at most 960.
         height: its height, pixels.
         fps: frames a second.
-        seconds: length; by default 10, or long enough for every pose of a dataset. A folder gets one frame for each of
-            ``views`` by default.
+        seconds: length; by default 10, or long enough for every pose of a dataset. A folder gets
+            one frame for each of ``views`` by default.
         force: overwrite existing files.
         progress: True shows a bar with the time left; a function is called with the share done.
 
@@ -86,19 +89,27 @@ def render_path(
     looking = Looking(views, up=up, data=data)
     kind = check_output(output, force)
     dense, source = read_source(scene, looking)
-    if source.given is not None and not isinstance(views, Views):  # from a file, as large as its photos
+    if source.given is not None and not isinstance(
+        views, Views
+    ):  # from a file, as large as its photos
         source = ViewSource(dense, source.given.resized(PHOTO_SIDE))
-    sources, loaded = [scene], [dense]
+    sources = [scene]
+    loaded = [dense]
     if other is not None:
         sources.append(other)
         loaded.append(_loaded(other).at_offset(dense.offset))
     if source.given is not None and kind == "frames" and seconds is None:
         settings = replace(settings, seconds=len(source.given) / fps)
     cameras, origin = camera_path(dense, source, settings, kind == "picture", looking.upward)
-    names = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
+    names = [
+        f"{_name(s, i)}, {len(g):,} Gaussians"
+        for i, (s, g) in enumerate(zip(sources, loaded, strict=True))
+    ]
     logger.info("%d x %d pixels: %s", cameras.width, cameras.height, origin)
     frames = render_frames(loaded, cameras, names if len(loaded) > 1 else ())
-    return write_frames(tracked(frames, "rendering", len(cameras), progress), Path(output), kind, fps)
+    return write_frames(
+        tracked(frames, "rendering", len(cameras), progress), Path(output), kind, fps
+    )
 
 
 def open_viewer(
@@ -113,16 +124,19 @@ def open_viewer(
 ) -> Viewer:
     """Show a scene, or two scenes with the same camera, in a browser with WebGL 2, which draws.
 
-    It opens upright, at the known or sampled view that shows most of the scene, or at the whole of an object.
+    It opens upright, at the known or sampled view that shows most of the scene, or at the whole of
+    an object.
 
     Args:
-        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped on it.
-        other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
+        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped
+            on it.
+        other: a second scene in the same frame, to compare with; by default the first is compared
+            with all of itself.
         views: known views of the first scene, as for :func:`render_path`.
         up: the axis that is up in the scene ("z", "-y"); by default the scene's own, or estimated.
         data: folder of the data of ``scene``, as for :func:`render_path`.
-        host: the address to listen on; by default only this machine has access. With another address, every machine
-            that reaches it has access.
+        host: the address to listen on; by default only this machine has access. With another
+            address, every machine that reaches it has access.
         port: the first port to try; 0 takes any free port.
 
     Returns:
@@ -154,8 +168,14 @@ def open_viewer(
             loaded = _loaded(shown).at_offset(scenes[0].scene.offset)
             source = view_source(loaded, run=path)
         else:
-            loaded, source = read_source(shown, Looking(views, data=data))  # upward is the page's, not merging's
-        levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
+            loaded, source = read_source(
+                shown, Looking(views, data=data)
+            )  # upward is the page's, not merging's
+        levels = (
+            []
+            if path is None or (path / RUN_FILES.config).is_file()
+            else coarser_levels(path, len(loaded))
+        )
         scenes.append(ViewedScene(_name(shown, index), path, loaded, source, levels))
     return Viewer(scenes, host, port, upward, None if scenes else read)
 

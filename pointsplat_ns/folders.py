@@ -1,7 +1,7 @@
 """Compacts every scene of a folder, and writes a table of the results.
 
-The record of a result ``room.ply`` is ``room.ply.json``. A result is finished if its record has the hash of the input
-file with the options, and that of the result itself.
+The record of a result ``room.ply`` is ``room.ply.json``. A result is finished if its record has the
+hash of the input file with the options, and that of the result itself.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from pointsplat_ns.io.files import (
     require_memory,
     write_csv,
     write_json,
-)  # fmt: skip
+)
 from pointsplat_ns.io.formats import format_like, format_to_write
 from pointsplat_ns.io.scene import read_scene, save_as, source_file, source_parts
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
@@ -74,7 +74,9 @@ class SceneResult:
     """Path of the file or run."""
     output: str
     """Path of the result."""
-    status: Literal["done", "done before", "failed", "open"]  # ``done before``: by an earlier call; ``open``: not yet
+    status: Literal[
+        "done", "done before", "failed", "open"
+    ]  # ``done before``: by an earlier call; ``open``: not yet
     before: int | None = None
     """Gaussians of the scene."""
     after: int | None = None
@@ -94,7 +96,9 @@ class SceneResult:
 
     def __str__(self) -> str:
         """What users read of a result."""
-        return "; ".join(filter(None, ("" if self.psnr is None else quality_line(self.psnr, None), self.note)))
+        return "; ".join(
+            filter(None, ("" if self.psnr is None else quality_line(self.psnr, None), self.note))
+        )
 
 
 @normal_mode
@@ -121,31 +125,42 @@ def compact_folder(
 ) -> list[SceneResult]:
     """Compact every scene of a folder by :func:`compact`, and write the results to another folder.
 
-    Unchanged results of the same scene and options are kept, so another call continues an interrupted one.
+    Unchanged results of the same scene and options are kept, so another call continues an
+    interrupted one.
 
     Args:
-        folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each experiment.
-        output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the table ``scenes.csv``;
-            by default beside ``folder``: ``scenes_compact`` for ``scenes``. Each result has the format of its scene's
-            file, or is a PLY where that cannot be written.
+        folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each
+            experiment.
+        output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the
+            table ``scenes.csv``; by default beside ``folder``: ``scenes_compact`` for ``scenes``.
+            Each result has the format of its scene's file, or is a PLY where that cannot be
+            written.
         keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format.
         refiner: as for :func:`~pointsplat_ns.load_refiner`; None for no refiner.
-        by, sh, clean, effort, seconds, target_db, resolution: as for :func:`compact`, for each scene.
-        data: folder above the data of the runs. A run whose data is not found gets sampled views, and a note.
-        target_format: suffix of all results, such as ".sog"; by default each result has the format of its scene.
-        html: an .html file for a gallery of all scenes before and after, with links to their files; written at the end.
+        by, sh, clean, effort, seconds, target_db, resolution: as for :func:`compact`, for each
+            scene.
+        data: folder above the data of the runs. A run whose data is not found gets sampled views,
+            and a note.
+        target_format: suffix of all results, such as ".sog"; by default each result has the format
+            of its scene.
+        html: an .html file for a gallery of all scenes before and after, with links to their files;
+            written at the end.
         picture: a .png file for the same pictures.
-        jobs: number of processes, which share the cores. With more than one, the program must be a file whose main code
-            is under ``if __name__ == "__main__":``, as for any Python program that starts processes.
+        jobs: number of processes, which share the cores. With more than one, the program must be a
+            file whose main code is under ``if __name__ == "__main__":``, as for any Python program
+            that starts processes.
         force: overwrite files of other origin, changed files, and results with other options.
-        progress: True shows a bar; a function is called with the name of the current task and its share done.
+        progress: True shows a bar; a function is called with the name of the current task and its
+            share done.
 
     Returns:
-        The result of each scene, sorted by name. One that fails has the status "failed" and does not stop the others.
+        The result of each scene, sorted by name. One that fails has the status "failed" and does
+        not stop the others.
 
     Raises:
         PointSplatError: if an option is not valid.
-        SceneError: if there is no scene, or the output folder, page or picture is one of other results.
+        SceneError: if there is no scene, or the output folder, page or picture is one of other
+            results.
 
     Example:
         >>> import tempfile
@@ -158,14 +173,24 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder) if output is None else Path(output)
-    size, trained = parse_resolution(resolution), None if refiner is None else _loaded(refiner)
-    request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds), target_db=target_db)
+    size = parse_resolution(resolution)
+    trained = None if refiner is None else _loaded(refiner)
+    request = CompactRequest.of(
+        trained, keep, by, sh, clean, RepairBudget(effort, seconds), target_db=target_db
+    )
     options: dict[str, str | float | bool | None] = {
-        "keep": str(request.prune.budget), "by": request.prune.by, "sh": sh, "clean": clean, "effort": effort,
-        "seconds": seconds, "target_db": target_db, "resolution": None if size is None else size_text(size),
+        "keep": str(request.prune.budget),
+        "by": request.prune.by,
+        "sh": sh,
+        "clean": clean,
+        "effort": effort,
+        "seconds": seconds,
+        "target_db": target_db,
+        "resolution": None if size is None else size_text(size),
         "data": None if data is None else str(data),
-        "refiner": None if trained is None else source_file(trained.source).sha256, "format": target_format,
-    }  # fmt: skip
+        "refiner": None if trained is None else source_file(trained.source).sha256,
+        "format": target_format,
+    }
     check_jobs(jobs)
     page, sheet = (None if path is None else Path(path) for path in (html, picture))
     for shown, end in ((page, ".html"), (sheet, ".png")):
@@ -173,14 +198,18 @@ def compact_folder(
             need_suffix(shown, end)
             need_new(shown, force or (target / FOLDER_FILES.scenes).exists())
     if os.path.realpath(folder) == os.path.realpath(target):
-        raise SceneError(f"{target}: holds the scenes themselves; name another folder for the results")
+        raise SceneError(
+            f"{target}: holds the scenes themselves; name another folder for the results"
+        )
     tasks = [
         _Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
         for name, path in find_scenes(folder).items()
     ]
     _describe(target, options, force)
     drawn = (page, sheet) != (None, None)
-    work = _Compacting(dataclasses.replace(request, refiner=None), refiner, size, data, options, drawn, force)
+    work = _Compacting(
+        dataclasses.replace(request, refiner=None), refiner, size, data, options, drawn, force
+    )
     results: dict[str, SceneResult] = {}
     try:
         with progress_bar(progress) as report, Workers(work, jobs) as workers:
@@ -221,7 +250,9 @@ class _Task:
     source: Path
     output: Path
 
-    def result(self, status: Literal["done", "done before", "failed", "open"], **facts: Any) -> SceneResult:
+    def result(
+        self, status: Literal["done", "done before", "failed", "open"], **facts: Any
+    ) -> SceneResult:
         return SceneResult(self.name, str(self.source), str(self.output), status, **facts)
 
     @property
@@ -231,18 +262,21 @@ class _Task:
 
 
 def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
-    """Write the options beside the results. Raises SceneError if the output is no folder, or holds results of other
-    options."""
+    """Write the options beside the results. Raises SceneError if the output is no folder, or holds
+    results of other options."""
     need_folder(output)
-    path, text = output / FOLDER_FILES.scenes, json_text(options) + "\n"
+    path = output / FOLDER_FILES.scenes
+    text = json_text(options) + "\n"
     try:
         other = path.exists() and read_text(path) != text
     except (OSError, ValueError) as error:
-        raise SceneError(f"{path}: cannot be read ({one_line(error)}); name another folder for the results") from error
+        raise SceneError(
+            f"{path}: cannot be read ({one_line(error)}); name another folder for the results"
+        ) from error
     if other and not force:
         raise SceneError(
-            f"{output}: holds results of other options, see {path.name}; name another folder, or overwrite them with "
-            "--force"
+            f"{output}: holds results of other options, see {path.name}; name another folder, or "
+            "overwrite them with --force"
         )
     write_json(options, path)
 
@@ -260,7 +294,8 @@ class _Compacting:
     force: bool
 
     def __call__(self, task: _Task) -> SceneResult:
-        """The result of a scene. An error gives one with the status ``failed``, and leaves no file."""
+        """The result of a scene. An error gives one with the status ``failed``, and leaves no
+        file."""
         start = time.perf_counter()
         try:
             for part in source_parts(task.source):
@@ -269,11 +304,15 @@ class _Compacting:
             text = json.dumps([source.sha256, self.options], sort_keys=True)
             key = hashlib.sha256(text.encode()).hexdigest()
             record = _read_record(task)
-            whole = record is not None and task.output.is_file() and content_hash(task.output) == record["sha256"]
+            whole = (
+                record is not None
+                and task.output.is_file()
+                and content_hash(task.output) == record["sha256"]
+            )
             if not whole and os.path.lexists(task.output) and not self.force:
                 raise SceneError(
-                    f"{task.output}: exists already, and was not made by an earlier call or was changed since; "
-                    "name another folder, or overwrite it with --force"
+                    f"{task.output}: exists already, and was not made by an earlier call or was "
+                    "changed since; name another folder, or overwrite it with --force"
                 )
             if record is None or not whole or record["key"] != key:
                 return self._make(task, source.bytes, key, start)
@@ -281,12 +320,20 @@ class _Compacting:
                 self._draw(task, read_scene(task.source), read_scene(task.output))
             return _known(task, record)
         except Exception as error:  # one scene must not stop the others
-            kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
-            return task.result("failed", seconds=time.perf_counter() - start, error=kind + one_line(error, limit=1000))
+            kind = (
+                "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
+            )
+            return task.result(
+                "failed",
+                seconds=time.perf_counter() - start,
+                error=kind + one_line(error, limit=1000),
+            )
 
     def _make(self, task: _Task, source_bytes: int, key: str, start: float) -> SceneResult:
-        """Write a result and its record. A process killed in between leaves the record alone: the scene is open."""
-        dense, kind = read_scene(task.source), format_to_write(task.output)
+        """Write a result and its record. A process killed in between leaves the record alone: the
+        scene is open."""
+        dense = read_scene(task.source)
+        kind = format_to_write(task.output)
         source = view_source(dense, run=task.source, data=self.data, resolution=self.resolution)
         prune = dataclasses.replace(self.request.prune, suffix=kind.suffix)
         trained = None if self.refiner is None else _loaded(self.refiner)
@@ -305,12 +352,14 @@ class _Compacting:
             psnr = math.inf if judge is None else judge.psnr(written)[0]
             done = task.result(
                 "done",
-                before=len(dense), after=len(scene),
-                megabytes_before=source_bytes / 1e6, megabytes=part.stat().st_size / 1e6,
+                before=len(dense),
+                after=len(scene),
+                megabytes_before=source_bytes / 1e6,
+                megabytes=part.stat().st_size / 1e6,
                 psnr=psnr if math.isfinite(psnr) else None,
                 seconds=time.perf_counter() - start,
                 note="kept whole" if same else source.missing[2:-1],
-            )  # fmt: skip
+            )
             for old in (task.output, pair_of(task.output)):  # must not stand beside the new record
                 old.unlink(missing_ok=True)
             proofs = {"key": key, "options": self.options, "sha256": content_hash(part)}

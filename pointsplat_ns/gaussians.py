@@ -1,7 +1,8 @@
 """The one container of a 3D Gaussian scene.
 
-Parameters are stored as in Splatfacto and the 3DGS PLY (natural-log scales, opacity logits, unnormalised wxyz
-quaternions, SH coefficients), so that reading and writing lose nothing. Activated values are computed properties.
+Parameters are stored as in Splatfacto and the 3DGS PLY (natural-log scales, opacity logits,
+unnormalised wxyz quaternions, SH coefficients), so that reading and writing lose nothing. Activated
+values are computed properties.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_
 
 
 def sh_degree_of(num_rest: int) -> int:
-    """SH degree of a scene with ``num_rest`` coefficients of degree 1 and higher for each colour channel.
+    """SH degree of a scene with ``num_rest`` coefficients of degree 1 and higher for each colour
+    channel.
 
     Raises:
         SceneError: if no degree from 0 to 3 has this number.
@@ -36,7 +38,8 @@ def sh_degree_of(num_rest: int) -> int:
         if (degree + 1) ** 2 - 1 == num_rest:
             return degree
     raise SceneError(
-        f"features_rest has {num_rest} coefficients a channel; expected 0, 3, 8 or 15 (SH degree 0 to {MAX_SH_DEGREE})"
+        f"features_rest has {num_rest} coefficients a channel; expected 0, 3, 8 or 15 (SH degree "
+        f"0 to {MAX_SH_DEGREE})"
     )
 
 
@@ -57,8 +60,8 @@ PLAIN = Traits()
 
 
 class _Activated(torch.autograd.Function):
-    """``exp`` or ``sigmoid`` of raw values; where the result or its slope is not finite, the gradient is 0, not NaN:
-    such a Gaussian is not drawn."""
+    """``exp`` or ``sigmoid`` of raw values; where the result or its slope is not finite, the
+    gradient is 0, not NaN: such a Gaussian is not drawn."""
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
@@ -77,27 +80,34 @@ class _Activated(torch.autograd.Function):
 
 @dataclass(frozen=True, repr=False)
 class Gaussians:
-    """A scene of N Gaussians, on one device and of one floating dtype, in Splatfacto's own parametrisation.
+    """A scene of N Gaussians, on one device and of one floating dtype, in Splatfacto's own
+    parametrisation.
 
     Attributes:
         means: (N, 3) positions, world, scene units.
-        scales: (N, 3) natural logarithms of the standard deviations along the Gaussian's own axes, which are in scene
-            units; -Inf is a flat axis, and above 88.7 float32 cannot hold the deviation.
-        quats: (N, 4) rotations of those axes into the world, quaternions wxyz of any length; zero is the identity.
+        scales: (N, 3) natural logarithms of the standard deviations along the Gaussian's own axes,
+            which are in scene units; -Inf is a flat axis, and above 88.7 float32 cannot hold the
+            deviation.
+        quats: (N, 4) rotations of those axes into the world, quaternions wxyz of any length; zero
+            is the identity.
         opacities: (N, 1) logits; +Inf is opacity 1 and -Inf opacity 0.
-        features_dc: (N, 3) constant SH coefficient of red, green and blue: colour = 0.5 + :data:`SH_C0` * features_dc.
+        features_dc: (N, 3) constant SH coefficient of red, green and blue: colour = 0.5 +
+            :data:`SH_C0` * features_dc.
         features_rest: (N, (d+1)^2 - 1, 3) the other coefficients of SH degree d, from 0 to 3.
-        antialiased: whether the scene was trained to be drawn antialiased (Mip-Splatting), and so is.
-        up: the axis that is up, "x", "y", "z", "-x", "-y" or "-z", if the scene's file declares it; else None.
-        offset: where the origin of ``means`` lies in the frame of the scene's file and of its poses, scene units, as
-            that of a geo-referenced scene; None for (0, 0, 0).
+        antialiased: whether the scene was trained to be drawn antialiased (Mip-Splatting), and so
+            is.
+        up: the axis that is up, "x", "y", "z", "-x", "-y" or "-z", if the scene's file declares it;
+            else None.
+        offset: where the origin of ``means`` lies in the frame of the scene's file and of its
+            poses, scene units, as that of a geo-referenced scene; None for (0, 0, 0).
 
     Raises:
-        SceneError: if a shape, device or dtype does not fit the others, no SH degree has this number of coefficients,
-            ``up`` is no axis, or ``offset`` is not three finite numbers.
+        SceneError: if a shape, device or dtype does not fit the others, no SH degree has this
+            number of coefficients, ``up`` is no axis, or ``offset`` is not three finite numbers.
 
     Example:
-        Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside it.
+        Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside
+        it.
 
         >>> import torch
         >>> import pointsplat_ns as ps
@@ -128,12 +138,20 @@ class Gaussians:
     offset: Offset | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        tails = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
+        tails = {
+            "means": (3,),
+            "scales": (3,),
+            "quats": (4,),
+            "opacities": (1,),
+            "features_dc": (3,),
+        }
         n = self.means.shape[0] if self.means.dim() else -1
         for name, tail in tails.items():
             shape = tuple(getattr(self, name).shape)
             if shape != (n, *tail):
-                raise SceneError(f"{name} has shape {shape}; expected ({n}, {', '.join(map(str, tail))})")
+                raise SceneError(
+                    f"{name} has shape {shape}; expected ({n}, {', '.join(map(str, tail))})"
+                )
         rest = tuple(self.features_rest.shape)
         if len(rest) != 3 or rest[0] != n or rest[2] != 3:
             raise SceneError(f"features_rest has shape {rest}; expected ({n}, (d+1)^2 - 1, 3)")
@@ -141,13 +159,16 @@ class Gaussians:
         for name, value in self.items():
             if value.device != self.means.device or value.dtype != self.means.dtype:
                 raise SceneError(
-                    f"{name} is {value.dtype} on {value.device} but means are {self.means.dtype} on {self.means.device}"
+                    f"{name} is {value.dtype} on {value.device} but means are {self.means.dtype} "
+                    f"on {self.means.device}"
                 )
         if not self.means.dtype.is_floating_point:
             raise SceneError(f"parameters are {self.means.dtype}; expected a floating-point type")
         if self.up is not None and self.up not in AXES:
             raise SceneError(f"up is {self.up!r}; expected {', '.join(AXES[:-1])} or {AXES[-1]}")
-        if self.offset is not None and not (len(self.offset) == 3 and all(map(math.isfinite, self.offset))):
+        if self.offset is not None and not (
+            len(self.offset) == 3 and all(map(math.isfinite, self.offset))
+        ):
             raise SceneError(f"offset is {self.offset!r}; expected three finite numbers")
 
     @classmethod
@@ -158,8 +179,8 @@ class Gaussians:
 
     @classmethod
     def cat(cls, scenes: Sequence[Gaussians]) -> Gaussians:
-        """All Gaussians of several scenes of one SH degree, in order; antialiased if one of the scenes is, with
-        the up axis and the offset of the first."""
+        """All Gaussians of several scenes of one SH degree, in order; antialiased if one of the
+        scenes is, with the up axis and the offset of the first."""
         first = scenes[0]
         parts = zip(*(scene.at_offset(first.offset).tensors() for scene in scenes), strict=True)
         traits = first.traits._replace(antialiased=any(scene.antialiased for scene in scenes))
@@ -182,12 +203,16 @@ class Gaussians:
         return dataclasses.replace(self, **changes)
 
     def at_offset(self, offset: Offset | None) -> Gaussians:
-        """The same scene with its positions about another point of its file's frame, moved in float64."""
-        old, new = self.offset or (0.0, 0.0, 0.0), offset or (0.0, 0.0, 0.0)
+        """The same scene with its positions about another point of its file's frame, moved in
+        float64."""
+        old = self.offset or (0.0, 0.0, 0.0)
+        new = offset or (0.0, 0.0, 0.0)
         declared = new if any(new) else None
         if old == new:
             return self if self.offset == declared else self.replace(offset=declared)
-        shift = torch.tensor([a - b for a, b in zip(old, new, strict=True)], **DOUBLES).to(self.device)
+        shift = torch.tensor([a - b for a, b in zip(old, new, strict=True)], **DOUBLES).to(
+            self.device
+        )
         return self.replace(means=(self.means.double() + shift).to(self.dtype), offset=declared)
 
     def __len__(self) -> int:
@@ -195,10 +220,14 @@ class Gaussians:
 
     def __repr__(self) -> str:
         drawn = ", antialiased" if self.antialiased else ""
-        return f"Gaussians({len(self):,}, SH degree {self.sh_degree}, {self.dtype}, {self.device}{drawn})"
+        return (
+            f"Gaussians({len(self):,}, SH degree {self.sh_degree}, {self.dtype}, "
+            f"{self.device}{drawn})"
+        )
 
     def __getitem__(self, index: int | slice | list[int] | Tensor) -> Gaussians:
-        """The scene of some Gaussians: by slice, boolean mask (N,), list or tensor of indices (K,), or one integer."""
+        """The scene of some Gaussians: by slice, boolean mask (N,), list or tensor of indices (K,),
+        or one integer."""
         if isinstance(index, int):
             index = [index]
         return self.map(lambda value: value[index])
@@ -243,8 +272,8 @@ class Gaussians:
 
     @property
     def stds(self) -> Tensor:
-        """Standard deviations along the Gaussian's own axes, scene units, (N, 3). The gradient of one that is NaN or
-        infinite is 0."""
+        """Standard deviations along the Gaussian's own axes, scene units, (N, 3). The gradient of
+        one that is NaN or infinite is 0."""
         return _Activated.apply(self.scales, torch.exp)
 
     @property
@@ -253,9 +282,10 @@ class Gaussians:
         return 4e-6 * sum(value.numel() for value in self.tensors())
 
     def usable(self) -> Tensor:
-        """Mask (N,) of drawable Gaussians: no value is NaN or infinite, except opacity logits (+-Inf are opacity 1 and
-        0) and log-scales of -Inf (a flat axis), and no standard deviation is infinite in the scene's dtype: log-scales
-        are at most 88.7 in float32 and bfloat16, 709 in float64 and 11 in float16."""
+        """Mask (N,) of drawable Gaussians: no value is NaN or infinite, except opacity logits
+        (+-Inf are opacity 1 and 0) and log-scales of -Inf (a flat axis), and no standard deviation
+        is infinite in the scene's dtype: log-scales are at most 88.7 in float32 and bfloat16, 709
+        in float64 and 11 in float16."""
         ok = torch.ones(len(self), dtype=torch.bool, device=self.device)
         for name, value in self.items() if len(self) else ():
             flat = value.reshape(len(self), -1)
@@ -264,7 +294,8 @@ class Gaussians:
             elif name == "scales":
                 bad = ~(flat.detach().exp() < torch.inf)  # of NaN, too
             elif bool(flat.sum().isfinite()):
-                continue  # a finite sum has only finite terms; thirty times faster than a test of each
+                # a finite sum has only finite terms; thirty times faster than a test of each
+                continue
             else:
                 bad = ~flat.isfinite()
             ok &= ~bad.any(dim=1)

@@ -1,4 +1,5 @@
-"""Figures of a scene: its file, counts, SH, up, fill, opacities, sizes, bounds and suspicious rows."""
+"""Figures of a scene: its file, counts, SH, up, fill, opacities, sizes, bounds and suspicious
+rows."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ class SceneInfo:
     """
 
     file: str
-    """The path of the scene; empty for Gaussians in memory, whose format is empty too, and whose size is 0."""
+    """The path of the scene; empty for Gaussians in memory, whose format is empty too, and whose
+    size is 0."""
     format: str
     """Name of the format; for a run or a checkpoint in one its method and step."""
     bytes: int
@@ -45,14 +47,15 @@ class SceneInfo:
     antialiased: bool
     """Whether the scene was trained with antialiasing, as its file or run says."""
     offset: list[float]
-    """Where the origin of positions lies in the frame of the file, scene units; empty if they are in that frame."""
+    """Where the origin of positions lies in the frame of the file, scene units; empty if they are
+    in that frame."""
     up: list[float]
     """The direction that is up, of length 1; empty if nothing is visible."""
     up_is_guess: bool
     """Whether it was estimated without evidence that agrees."""
     fill: float | None
-    """Mean number of Gaussians drawn per pixel (:func:`pointsplat_ns.comparing.fill.fill`) in sampled views; None if
-    there are none."""
+    """Mean number of Gaussians drawn per pixel (:func:`pointsplat_ns.comparing.fill.fill`) in
+    sampled views; None if there are none."""
     views: str
     """Number and size of these views, as text."""
     sh_energies: list[float]
@@ -60,7 +63,8 @@ class SceneInfo:
     opacities: list[int]
     """Gaussians by opacity, in ten bins from 0 to 1."""
     sizes: dict[str, int]
-    """Gaussians by their largest standard deviation, scene units: powers of ten, by their lower bound."""
+    """Gaussians by their largest standard deviation, scene units: powers of ten, by their lower
+    bound."""
     bounds: list[list[float]]
     """Lowest and highest corner of all positions."""
     content: list[list[float]]
@@ -70,8 +74,13 @@ class SceneInfo:
 
     @property
     def up_text(self) -> str:
-        """The direction that is up, named or in numbers, and whether it is a guess; "unknown" if nothing is visible."""
-        return str(Up(torch.tensor(self.up, **DOUBLES), not self.up_is_guess)) if self.up else "unknown"
+        """The direction that is up, named or in numbers, and whether it is a guess; "unknown" if
+        nothing is visible."""
+        return (
+            str(Up(torch.tensor(self.up, **DOUBLES), not self.up_is_guess))
+            if self.up
+            else "unknown"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The figures as numbers, lists and dictionaries that JSON can hold."""
@@ -79,13 +88,15 @@ class SceneInfo:
 
 
 def info(
-    scene: Gaussians | str | Path, resolution: tuple[int, int] | str | None = None, up: str | None = None
+    scene: Gaussians | str | Path,
+    resolution: tuple[int, int] | str | None = None,
+    up: str | None = None,
 ) -> SceneInfo:
     """Measure a scene.
 
     Args:
-        scene: N Gaussians, or the path of a scene. Undrawable Gaussians of a file are counted too; other functions drop
-            them when reading.
+        scene: N Gaussians, or the path of a scene. Undrawable Gaussians of a file are counted too;
+            other functions drop them when reading.
         resolution: size of the pictures in which fill is counted, pixels; by default 1920x1080.
         up: the axis that is up, such as "-y"; by default the scene's own, or estimated.
 
@@ -99,8 +110,11 @@ def info(
         >>> found.gaussians, found.sh_degree, found.up_text
         (62845, 1, 'z (a guess)')
     """
-    size, known = parse_resolution(resolution), up_named(up)
-    file, kind, bytes_ = "", "", 0
+    size = parse_resolution(resolution)
+    known = up_named(up)
+    file = ""
+    kind = ""
+    bytes_ = 0
     if not isinstance(scene, Gaussians):
         file = str(scene)
         scene = read_scene(scene, all_rows=True)
@@ -114,9 +128,12 @@ def info(
     try:
         views = source.whole()
         up_found: Up | None = source.sampler.up
-        filled, views_text = fill(good, views), f"{len(views)} views of {views.width} x {views.height} pixels"
+        filled = fill(good, views)
+        views_text = f"{len(views)} views of {views.width} x {views.height} pixels"
     except DataError:  # nothing is visible
-        up_found, filled, views_text = known, None, ""
+        up_found = known
+        filled = None
+        views_text = ""
     return SceneInfo(
         file=file,
         format=kind,
@@ -156,12 +173,15 @@ def _by_powers_of_ten(log_sizes: Tensor) -> dict[str, int]:
     powers = (log_sizes.double() / math.log(10)).floor()
     flat = powers.isinf()
     values, counts = powers[~flat].unique(return_counts=True)
-    sizes = {f"1e{int(value):+03d}": int(count) for value, count in zip(values, counts, strict=True)}
+    sizes = {
+        f"1e{int(value):+03d}": int(count) for value, count in zip(values, counts, strict=True)
+    }
     return {"0": int(flat.sum()), **sizes} if bool(flat.any()) else sizes
 
 
 def _corners(means: Tensor, outside: float) -> list[list[float]]:
-    """Corners of the box of the positions, without the share ``outside`` of them at each end of each axis."""
+    """Corners of the box of the positions, without the share ``outside`` of them at each end of
+    each axis."""
     if not len(means):
         return []
     ranked = means.sort(dim=0).values

@@ -40,16 +40,17 @@ VIEW_COUNTS = ViewCounts()
 
 
 class ViewSource:
-    """Views of a scene, looked up or sampled when they are first needed (a budget in Gaussians needs none).
+    """Views of a scene, looked up or sampled when they are first needed (a budget in Gaussians
+    needs none).
 
     Args:
         scene: the scene that the views are for.
         given: views to use; ``run`` and ``dataset_views`` are then ignored.
-        run: the file or folder that the scene was read from. If it is a run whose data is found, its training poses
-            are used.
+        run: the file or folder that the scene was read from. If it is a run whose data is found,
+            its training poses are used.
         dataset_views: function that reads the poses of a run's dataset.
-        resolution: width and height, pixels, of the pictures that people look at. By default given views and photos
-            have their own, and sampled views 1920 x 1080.
+        resolution: width and height, pixels, of the pictures that people look at. By default given
+            views and photos have their own, and sampled views 1920 x 1080.
         up: which way is up, for sampled views; by default what the scene declares, or estimated.
     """
 
@@ -62,12 +63,17 @@ class ViewSource:
         resolution: tuple[int, int] | None = None,
         up: Up | None = None,
     ):
-        self._resolution, self._up = resolution, up
-        self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
+        self._resolution = resolution
+        self._up = up
+        self._scene = scene
+        self._given = given
+        self._run = run
+        self._dataset_views = dataset_views
         self.origin = ""
         """Text that says where views came from; empty until there are some."""
         self.missing = ""
-        """Text in brackets that says why a run's dataset gives no poses; empty if it does, or was not looked for."""
+        """Text in brackets that says why a run's dataset gives no poses; empty if it does, or was
+        not looked for."""
 
     @property
     def text(self) -> str:
@@ -99,8 +105,8 @@ class ViewSource:
         return self._of_dataset if self.given is None else self.given
 
     def known(self, count: int) -> Views | None:
-        """At most ``count`` known views: given ones, or those of the dataset's training poses; None if there are
-        none."""
+        """At most ``count`` known views: given ones, or those of the dataset's training poses; None
+        if there are none."""
         if self._known is None:
             return None
         self.origin = "poses of the dataset" if self.given is None else "given views"
@@ -134,7 +140,8 @@ class ViewSource:
         return views if self._resolution is None else views.resized(max(self._resolution))
 
     def whole(self) -> Views:
-        """The views in which renders are compared, at their full size: at most ``VIEW_COUNTS.compared``."""
+        """The views in which renders are compared, at their full size: at most
+        ``VIEW_COUNTS.compared``."""
         return self._whole
 
     @cached_property
@@ -142,7 +149,8 @@ class ViewSource:
         return self.views(VIEW_COUNTS.compared)
 
     def compared(self) -> Views:
-        """The views in which renders are compared, at :func:`~pointsplat_ns.comparing.sizes.middle_sized` size."""
+        """The views in which renders are compared, at
+        :func:`~pointsplat_ns.comparing.sizes.middle_sized` size."""
         return middle_sized(self._whole)
 
     def scored(self, count: int) -> Views:
@@ -152,12 +160,12 @@ class ViewSource:
     def others(
         self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = SMALLEST_SIDE
     ) -> Iterator[View]:
-        """Views to optimise on, without end: none of the :meth:`compared` ones, in random order, each once before any
-        is repeated. Each is subsampled from a picture of one of
+        """Views to optimise on, without end: none of the :meth:`compared` ones, in random order,
+        each once before any is repeated. Each is subsampled from a picture of one of
         :func:`~pointsplat_ns.comparing.sizes.several_sizes`, the next time of another.
 
-        They are known views; if these are fewer than the compared ones, known and sampled ones in turn; if all known
-        ones are compared, or there are none, sampled ones.
+        They are known views; if these are fewer than the compared ones, known and sampled ones in
+        turn; if all known ones are compared, or there are none, sampled ones.
 
         Args:
             seed: seed of the order, and of sampled views.
@@ -167,7 +175,8 @@ class ViewSource:
         Raises:
             DataError: if none can be sampled.
         """
-        known, compared = self._known, self.compared()
+        known = self._known
+        compared = self.compared()
         every = 0 if known is None else len(known)
         left = sorted(set(range(every)) - set(spread_indices(every, VIEW_COUNTS.compared)))
         if known is None or not left:
@@ -177,24 +186,31 @@ class ViewSource:
         if len(left) > len(compared):
             yield from others
         else:
-            for pair in zip(others, self.sampled(seed, count, drawn_side), strict=False):  # neither ends
+            for pair in zip(
+                others, self.sampled(seed, count, drawn_side), strict=False
+            ):  # neither ends
                 yield from pair
 
     def sampled(
         self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = SMALLEST_SIDE
     ) -> Iterator[View]:
-        """Sampled views without end, in the order and of the sizes of :meth:`others`, which has the arguments."""
-        compared, views = self.compared(), self.sampler.views(count, seed + 1)
-        views = replace(views, background=compared.background, rasterize_mode=compared.rasterize_mode)
+        """Sampled views without end, in the order and of the sizes of :meth:`others`, which has the
+        arguments."""
+        compared = self.compared()
+        views = self.sampler.views(count, seed + 1)
+        views = replace(
+            views, background=compared.background, rasterize_mode=compared.rasterize_mode
+        )
         for turn, view in enumerate(_shuffled(views, seed, drawn_side)):
             opposite = self._known is None and turn % 5 == 4  # the viewer's background is unknown
             yield replace(view, background=1 - view.background) if opposite else view
 
 
 def _shuffled(views: Views, seed: int, drawn_side: int) -> Iterator[View]:
-    """Views in random order, each once before any is repeated, then of another size; without end. A view that comes
-    again is the same object."""
-    sizes, generator = [[*of_size] for of_size in several_sizes(views, drawn_side)], random.Random(seed)
+    """Views in random order, each once before any is repeated, then of another size; without end. A
+    view that comes again is the same object."""
+    sizes = [[*of_size] for of_size in several_sizes(views, drawn_side)]
+    generator = random.Random(seed)
     for lap in counted():
         for index in generator.sample(range(len(views)), len(views)):
             yield sizes[(lap + index) % len(sizes)][index]

@@ -19,12 +19,14 @@ NEAR_PLANE = 0.01
 """Near plane of gsplat, scene units."""
 
 EPS2D = 0.3
-"""Added to the diagonal of each projected covariance, pixels^2: nothing is thinner than a pixel. As in 3DGS, gsplat."""
+"""Added to the diagonal of each projected covariance, pixels^2: nothing is thinner than a pixel. As
+in 3DGS, gsplat."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One pinhole camera and its rendering settings: an element of :class:`Views`, which explains its attributes.
+    """One pinhole camera and its rendering settings: an element of :class:`Views`, which explains
+    its attributes.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -47,12 +49,12 @@ class View:
 class Views:
     """C pinhole cameras of one image size and their rendering settings.
 
-    ``views[0]`` and iteration give a :class:`View`; slices, lists of indices, index tensors and boolean masks give
-    :class:`Views`.
+    ``views[0]`` and iteration give a :class:`View`; slices, lists of indices, index tensors and
+    boolean masks give :class:`Views`.
 
     Attributes:
-        viewmats: (C, 4, 4), take world to camera coordinates, OpenCV axes (x right, y down, z forward); rigid motions
-            in scene units.
+        viewmats: (C, 4, 4), take world to camera coordinates, OpenCV axes (x right, y down, z
+            forward); rigid motions in scene units.
         Ks: (C, 3, 3) intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
         width: width of every image, pixels.
         height: height of every image, pixels.
@@ -84,12 +86,18 @@ class Views:
 
     def __post_init__(self) -> None:
         count = self.viewmats.shape[0] if self.viewmats.dim() else 0
-        for name, shape in (("viewmats", (count, 4, 4)), ("Ks", (count, 3, 3)), ("background", (3,))):
+        for name, shape in (
+            ("viewmats", (count, 4, 4)),
+            ("Ks", (count, 3, 3)),
+            ("background", (3,)),
+        ):
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise DataError(f"{name} of the views has shape {found}; expected {shape}")
         if self.width < 1 or self.height < 1:
-            raise DataError(f"views are {self.width} x {self.height} pixels; expected at least 1 x 1")
+            raise DataError(
+                f"views are {self.width} x {self.height} pixels; expected at least 1 x 1"
+            )
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]
@@ -103,21 +111,31 @@ class Views:
     def __getitem__(self, index: slice | list[int] | Tensor) -> Views: ...
 
     def __getitem__(self, index: Any) -> View | Views:
-        """One view by an integer; several by a slice, a list or tensor of indices, or a boolean mask (C,).
+        """One view by an integer; several by a slice, a list or tensor of indices, or a boolean
+        mask (C,).
 
         Raises:
             IndexError: if there is no such view.
         """
-        viewmats, Ks = self.viewmats[index], self.Ks[index]
+        viewmats = self.viewmats[index]
+        Ks = self.Ks[index]
         kind = View if viewmats.dim() == 2 else Views
-        same = self.width, self.height, self.background, self.rasterize_mode, self.near_plane, self.eps2d
+        same = (
+            self.width,
+            self.height,
+            self.background,
+            self.rasterize_mode,
+            self.near_plane,
+            self.eps2d,
+        )
         return kind(viewmats, Ks, *same)
 
     def __iter__(self) -> Iterator[View]:
         return (self[index] for index in range(len(self)))
 
     def relative_to(self, offset: tuple[float, float, float] | None) -> Views:
-        """The same views for a scene whose positions are relative to an offset, scene units; computed in float64."""
+        """The same views for a scene whose positions are relative to an offset, scene units;
+        computed in float64."""
         if offset is None:
             return self
         viewmats = self.viewmats.double()
@@ -126,17 +144,20 @@ class Views:
         return replace(self, viewmats=moved.to(self.viewmats.dtype))
 
     def spread(self, count: int) -> Views:
-        """At most ``count`` of the views, evenly spread over their order, with the first and the last."""
+        """At most ``count`` of the views, evenly spread over their order, with the first and the
+        last."""
         if count >= len(self):
             return self
         return self[spread_indices(len(self), count)]
 
     def resized(self, max_side: int) -> Views:
-        """The same views with the longer side of the image at most ``max_side`` pixels; images are never enlarged."""
+        """The same views with the longer side of the image at most ``max_side`` pixels; images are
+        never enlarged."""
         factor = max_side / max(self.width, self.height)
         if factor >= 1:
             return self
-        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        width = max(1, round(self.width * factor))
+        height = max(1, round(self.height * factor))
         stretch = self.Ks.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return replace(self, Ks=self.Ks * stretch, width=width, height=height)
 

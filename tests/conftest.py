@@ -25,19 +25,36 @@ LPIPS_WEIGHTS = SHARED_DATA / "weights"
 
 def wall_colors(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Colours (..., 3) in [0, 1] of the wall at x, y in scene units."""
-    return np.stack([0.5 + 0.4 * np.sin(4 * x), 0.5 + 0.4 * np.cos(5 * y), 0.5 + 0.4 * np.sin(3 * x + 2 * y)], axis=-1)
+    return np.stack(
+        [0.5 + 0.4 * np.sin(4 * x), 0.5 + 0.4 * np.cos(5 * y), 0.5 + 0.4 * np.sin(3 * x + 2 * y)],
+        axis=-1,
+    )
 
 
 @pytest.fixture(scope="session")
 def wall_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Exact photos, depth images and poses of a painted wall, in the Replica layout; shared by all tests, so do not
-    write to it. The cameras stand 2 units before the wall z = 0, look along +z and step sideways."""
+    """Exact photos, depth images and poses of a painted wall, in the Replica layout; shared by all
+    tests, so do not write to it. The cameras stand 2 units before the wall z = 0, look along +z and
+    step sideways."""
     folder = tmp_path_factory.mktemp("replica")
-    width, height, focal, scale = 64, 48, 60.0, 6553.5
-    camera = {"w": width, "h": height, "fx": focal, "fy": focal, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    width = 64
+    height = 48
+    focal = 60.0
+    scale = 6553.5
+    camera = {
+        "w": width,
+        "h": height,
+        "fx": focal,
+        "fy": focal,
+        "cx": (width - 1) / 2,
+        "cy": (height - 1) / 2,
+    }
     (folder / "cam_params.json").write_text(json.dumps({"camera": {**camera, "scale": scale}}))
     places = np.array([(0.6 * math.cos(i), 0.4 * math.sin(2 * i), -2.0) for i in range(11)])
-    rays = np.stack(np.meshgrid(np.arange(width) - camera["cx"], np.arange(height) - camera["cy"])) / focal
+    rays = (
+        np.stack(np.meshgrid(np.arange(width) - camera["cx"], np.arange(height) - camera["cy"]))
+        / focal
+    )
     walls = (wall_colors(*(place[:2, None, None] + 2 * rays)) for place in places)
     photos = (np.round(255 * colors).astype(np.uint8) for colors in walls)
     return write_frames(folder / "wall", photos, places, round(2 * scale))
@@ -45,14 +62,16 @@ def wall_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def wall_config() -> Callable:
-    """A function (scene, output_dir, steps) that gives the config of a short splatfacto-cpu training."""
+    """A function (scene, output_dir, steps) that gives the config of a short splatfacto-cpu
+    training."""
     from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
 
     def config_of(scene: Path, output_dir: Path, steps: int):
         config = splatfacto_cpu_config()
         config.machine.device_type = "cpu"
-        config.output_dir, config.max_num_iterations = output_dir, steps
+        config.output_dir = output_dir
+        config.max_num_iterations = steps
         config.pipeline.datamanager.dataparser = ReplicaDataParserConfig(num_seed_points=300)
         config.pipeline.datamanager.data = config.data = scene
         config.pipeline.model.refine_every = 10
@@ -65,7 +84,8 @@ def wall_config() -> Callable:
 
 @pytest.fixture(scope="session")
 def run_training() -> Callable:
-    """A function that trains a config with nerfstudio's trainer and gives the trainer and the loss of every step."""
+    """A function that trains a config with nerfstudio's trainer and gives the trainer and the loss
+    of every step."""
 
     def run(config):
         torch.manual_seed(SEED)
@@ -74,7 +94,8 @@ def run_training() -> Callable:
         trainer.setup()
         losses = losses_of(trainer)
         with warnings.catch_warnings():
-            # torch: "lr_scheduler.step() before optimizer.step()", because it does not see the gradient scaler's step
+            # torch: "lr_scheduler.step() before optimizer.step()", because it does not see the
+            # gradient scaler's step
             warnings.filterwarnings("ignore", category=UserWarning, module="torch.optim.*")
             trainer.train()
         return trainer, losses
@@ -84,7 +105,8 @@ def run_training() -> Callable:
 
 @pytest.fixture(scope="session")
 def trained_walls(wall_scene, wall_config, run_training, tmp_path_factory) -> Path:
-    """Folder with two short splatfacto-cpu runs: ``wall-a``, and ``wall-b`` of SH degree 1, antialiased, over white.
+    """Folder with two short splatfacto-cpu runs: ``wall-a``, and ``wall-b`` of SH degree 1,
+    antialiased, over white.
 
     Shared by all tests, so do not write to it.
     """
@@ -115,7 +137,8 @@ def no_lpips(tmp_path_factory, monkeypatch):
 
 @pytest.fixture()
 def some_lpips(request, monkeypatch) -> bool:
-    """LPIPS from the weights at hand; without them, none and no attempt at a download. Says which."""
+    """LPIPS from the weights at hand; without them, none and no attempt at a download. Says
+    which."""
     if LPIPS_WEIGHTS.exists():
         monkeypatch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(LPIPS_WEIGHTS))
     else:
@@ -125,11 +148,13 @@ def some_lpips(request, monkeypatch) -> bool:
 
 @pytest.fixture(scope="session")
 def make_refined_run() -> Callable:
-    """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved`` to every opacity
-    logit and nothing else, and gives its folder."""
+    """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved``
+    to every opacity logit and nothing else, and gives its folder."""
     from pointsplat_ns.refiner import Refiner, preset
 
-    def make(folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model) -> Path:
+    def make(
+        folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model
+    ) -> Path:
         config = small_config(data, folder, 10, **model)
         config.pipeline.datamanager.eval_scenes = eval_scenes
         config.save_config()
@@ -138,10 +163,18 @@ def make_refined_run() -> Callable:
         with torch.no_grad():
             [*refiner.heads.mlps["opacities"].modules()][-1].bias.fill_(moved)
         state = {f"_model.refiner.{name}": value for name, value in refiner.state_dict().items()}
-        # The rate of a cosine schedule is a numpy number, which torch refuses to load unless it is told otherwise.
-        state = {"step": 9, "pipeline": state, "schedulers": {"encoder": {"_last_lr": [np.float64(0.1)]}}}
+        # The rate of a cosine schedule is a numpy number, which torch refuses to load unless it is
+        # told otherwise.
+        state = {
+            "step": 9,
+            "pipeline": state,
+            "schedulers": {"encoder": {"_last_lr": [np.float64(0.1)]}},
+        }
         config.get_checkpoint_dir().mkdir()
-        torch.save(state | {"optimizers": {}, "scalers": {}}, config.get_checkpoint_dir() / "step-000000009.ckpt")
+        torch.save(
+            state | {"optimizers": {}, "scalers": {}},
+            config.get_checkpoint_dir() / "step-000000009.ckpt",
+        )
         return config.get_base_dir()
 
     return make
@@ -149,11 +182,13 @@ def make_refined_run() -> Callable:
 
 @pytest.fixture(scope="session")
 def hollow_ball() -> Gaussians:
-    """The inside of a ball of radius 2 about (5, 0, 0), covered with opaque blobs, and an outlier far away; shared by
-    all tests, so do not write to it."""
+    """The inside of a ball of radius 2 about (5, 0, 0), covered with opaque blobs, and an outlier
+    far away; shared by all tests, so do not write to it."""
     scene = ball(1500, 2, log_size=math.log(0.12))
     noise = 0.3 * torch.randn(1500, 3, generator=torch.Generator().manual_seed(1))
-    scene = scene.replace(means=scene.means + torch.tensor([5.0, 0.0, 0.0]), features_dc=scene.features_dc + noise)
+    scene = scene.replace(
+        means=scene.means + torch.tensor([5.0, 0.0, 0.0]), features_dc=scene.features_dc + noise
+    )
     scene.means[0] = 1e6
     return scene
 

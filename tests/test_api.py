@@ -19,7 +19,9 @@ def test_every_public_name_has_an_example_and_documents_its_arguments(name):
     text = inspect.getdoc(value) or ""
     [examples] = doctest.DocTestFinder(recurse=False).find(value, name)
     assert "\nExample:\n" in text and examples.examples
-    if inspect.isfunction(value) and name != "rasterization":  # documented in its signature, as gsplat's is
+    if (
+        inspect.isfunction(value) and name != "rasterization"
+    ):  # documented in its signature, as gsplat's is
         signature = inspect.signature(value)
         assert signature.return_annotation is not inspect.Signature.empty
         for parameter in signature.parameters.values():
@@ -33,7 +35,9 @@ def test_dir_lists_the_public_names_alone():
 
 
 def test_render_says_what_it_expects_for_views():
-    with pytest.raises(TypeError, match=r"views is 3; expected a View or Views, such as sample_views\(scene, 3\)"):
+    with pytest.raises(
+        TypeError, match=r"views is 3; expected a View or Views, such as sample_views\(scene, 3\)"
+    ):
         ps.render(ps.example_room()[:3], 3)
 
 
@@ -79,7 +83,11 @@ def test_a_run_of_the_refiner_is_loaded_pruned_and_refined(refiner_run, caplog):
 def test_pointsplat_prune_writes_what_prune_gives(options, scene, tmp_path):
     ply = tmp_path / "room.ply"
     ps.save(scene, ply)
-    words = [str(word) for name, value in options.items() for word in (f"--{name.replace('_', '-')}", value)]
+    words = [
+        str(word)
+        for name, value in options.items()
+        for word in (f"--{name.replace('_', '-')}", value)
+    ]
     main(["prune", str(ply), *words, "-o", str(tmp_path / "by_command.ply")])
     ps.save(ps.prune(ply, **options), tmp_path / "by_api.ply")
     assert (tmp_path / "by_command.ply").read_bytes() == (tmp_path / "by_api.ply").read_bytes()

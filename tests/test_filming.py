@@ -38,7 +38,9 @@ def test_film_of_a_scene_moves(tmp_path):
     scene = ball(700, log_size=math.log(0.06))
     assert ps.render_path(scene, tmp_path / "frames", seconds=0.6, **SMALL) == 6
     frames = frames_in(tmp_path / "frames")
-    assert len(frames) == 6 and all(frame.shape == (48, 64, 3) and frame.std() > 10 for frame in frames)
+    assert len(frames) == 6 and all(
+        frame.shape == (48, 64, 3) and frame.std() > 10 for frame in frames
+    )
     assert all((a != b).mean() > 0.1 for a, b in zip(frames, frames[1:], strict=False))
 
 
@@ -46,7 +48,8 @@ def test_film_of_a_run_goes_exactly_through_its_photos(trained_walls, tmp_path, 
     run = run_of(trained_walls, "wall-b")
     with caplog.at_level("INFO", "pointsplat_ns"):
         count = ps.render_path(run, tmp_path / "frames", fps=2)
-    views, frames = ps.dataset_views(run), frames_in(tmp_path / "frames")
+    views = ps.dataset_views(run)
+    frames = frames_in(tmp_path / "frames")
     assert count == len(frames) == 20 and "along the poses of the dataset" in caplog.text
     for view in views:  # antialiased, over white
         shown = to_uint8(ps.render(ps.load(run), view)).astype(int)
@@ -76,14 +79,20 @@ def test_command_writes_what_the_function_writes(files, tmp_path, capsys):
     main(["render", *scenes, "-o", str(tmp_path / "by_command"), *options])
     assert re.search(r"by_command: 3 frames, [\d.]+ kB, in ", capsys.readouterr().out)
     ps.render_path(scenes[0], tmp_path / "by_function", scenes[1], seconds=0.3, **SMALL)
-    pairs = zip(frames_in(tmp_path / "by_command"), frames_in(tmp_path / "by_function"), strict=True)
-    assert all((one == other).all() and one.shape == (48, 128, 3) for one, other in pairs), "side by side"
+    pairs = zip(
+        frames_in(tmp_path / "by_command"), frames_in(tmp_path / "by_function"), strict=True
+    )
+    assert all((one == other).all() and one.shape == (48, 128, 3) for one, other in pairs), (
+        "side by side"
+    )
 
 
 def test_given_views_keep_their_size_and_photos_are_reduced(scene, tmp_path):
     ps.render_path(scene, tmp_path / "given.png", views=ps.sample_views(scene, 1, 1001, 50))
     assert Image.open(tmp_path / "given.png").size == (1000, 50)
-    ps.render_path(scene, tmp_path / "narrow.png", views=ps.sample_views(scene, 1, 1001, 50), width=80)
+    ps.render_path(
+        scene, tmp_path / "narrow.png", views=ps.sample_views(scene, 1, 1001, 50), width=80
+    )
     assert Image.open(tmp_path / "narrow.png").size == (80, 4)
 
 

@@ -1,4 +1,5 @@
-"""Folders of scenes: what is finished is skipped, what failed or was changed is not, and nothing half-made stays."""
+"""Folders of scenes: what is finished is skipped, what failed or was changed is not, and nothing
+half-made stays."""
 
 import csv
 import json
@@ -30,7 +31,9 @@ def made(monkeypatch) -> mock.Mock:
 
 def settle(folder: Path, keep: str = "50%", **options) -> dict[str, ps.SceneResult]:
     small = folder.parent / "small"
-    results = ps.compact_folder(folder, small, keep, by="opacity", effort="instant", resolution="32x24", **options)
+    results = ps.compact_folder(
+        folder, small, keep, by="opacity", effort="instant", resolution="32x24", **options
+    )
     return {result.name: result for result in results}
 
 
@@ -45,7 +48,9 @@ ABOUT = {"pointsplat-scenes.json", "scenes.csv"}
 
 def test_what_is_finished_is_not_made_again_and_what_is_not_is(folder, made):
     first = settle(folder)
-    (folder.parent / "small" / "b.ply").unlink()  # as by a process killed before it renamed the result
+    (
+        folder.parent / "small" / "b.ply"
+    ).unlink()  # as by a process killed before it renamed the result
     ps.save(ball(80, 0, 9), folder / "deep" / "c.ply", overwrite=True)
     second = settle(folder)
     statuses = {name: result.status for name, result in second.items()}
@@ -58,7 +63,9 @@ def test_what_is_finished_is_not_made_again_and_what_is_not_is(folder, made):
 
 def test_other_options_need_another_folder_or_force(folder):
     settle(folder)
-    with pytest.raises(SceneError, match=r"holds results of other options, see pointsplat-scenes.json.*--force"):
+    with pytest.raises(
+        SceneError, match=r"holds results of other options, see pointsplat-scenes.json.*--force"
+    ):
         settle(folder, "10%")
     assert {result.status for result in settle(folder, "10%", force=True).values()} == {"done"}
     assert {result.status for result in settle(folder, "10%").values()} == {"done before"}
@@ -70,7 +77,9 @@ def test_a_damaged_record_or_description_is_never_believed(folder):
     wrong = json.dumps({**json.loads(record.read_text()), "before": "6"})
     for content in ("", "[]", '{"status": "done"}', "[" * 100_000, wrong):
         record.write_text(content)
-        assert settle(folder)["a"].status == "failed", "the result was taken for its own, or for nobody's"
+        assert settle(folder)["a"].status == "failed", (
+            "the result was taken for its own, or for nobody's"
+        )
     (folder.parent / "small" / "pointsplat-scenes.json").write_bytes(b"{\xff}")
     with pytest.raises(SceneError, match=r"pointsplat-scenes.json: cannot be read"):
         settle(folder)
@@ -94,7 +103,11 @@ def test_a_scene_that_fails_stops_no_other_in_several_processes(folder):
     shares: list[float] = []
     results = settle(folder, jobs=2, progress=lambda _, share: shares.append(share))
     assert results["huge"].status == "failed" and "8796.1 GB of memory" in results["huge"].error
-    assert {name for name, result in results.items() if result.status == "done"} == {"a", "b", "deep/c"}
+    assert {name for name, result in results.items() if result.status == "done"} == {
+        "a",
+        "b",
+        "deep/c",
+    }
     assert shares[0] == 0 and shares[-1] == 1 and shares == sorted(shares)
 
 
@@ -105,7 +118,8 @@ def test_what_the_folder_cannot_take_is_one_line(folder):
 
 
 def test_links_among_the_tables_of_a_folder_are_not_written_through(folder):
-    small, diary = folder.parent / "small", folder.parent / "diary.txt"
+    small = folder.parent / "small"
+    diary = folder.parent / "diary.txt"
     diary.write_text("precious")
     small.mkdir()
     for name in ("scenes.csv", "a.ply.json"):

@@ -34,7 +34,8 @@ def test_mixed_or_integer_types_are_named():
 
 
 @pytest.mark.parametrize(
-    "index", [slice(1, 4), torch.tensor([4, 0, 0]), torch.tensor([True, False, True, False, False]), 2, -1]
+    "index",
+    [slice(1, 4), torch.tensor([4, 0, 0]), torch.tensor([True, False, True, False, False]), 2, -1],
 )
 def test_selection_takes_the_same_rows_of_every_parameter(index):
     scene = normal_scene()
@@ -52,19 +53,24 @@ def test_selecting_nothing_leaves_an_empty_scene_of_the_same_degree():
 
 def test_activated_values_at_the_extremes():
     scene = normal_scene(3).replace(
-        opacities=torch.tensor([[math.inf], [-math.inf], [0.0]]), scales=torch.tensor([[-math.inf, 0.0, 1.0]] * 3)
+        opacities=torch.tensor([[math.inf], [-math.inf], [0.0]]),
+        scales=torch.tensor([[-math.inf, 0.0, 1.0]] * 3),
     )
     assert scene.alphas.tolist() == [1.0, 0.0, 0.5]
     assert scene.stds[0].tolist() == pytest.approx([0.0, 1.0, math.e])
 
 
-@pytest.mark.parametrize("name", ["means", "scales", "quats", "opacities", "features_dc", "features_rest"])
+@pytest.mark.parametrize(
+    "name", ["means", "scales", "quats", "opacities", "features_dc", "features_rest"]
+)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_usable_tells_meaningless_values_from_meaningful_ones(name, value):
     scene = normal_scene()
     spoiled = getattr(scene, name).clone()
     spoiled[2].view(-1)[0] = value
-    meaningful = (name == "opacities" and math.isinf(value)) or (name == "scales" and value == -math.inf)
+    meaningful = (name == "opacities" and math.isinf(value)) or (
+        name == "scales" and value == -math.inf
+    )
     expected = [True, True, meaningful, True, True]
     assert scene.replace(**{name: spoiled}).usable().tolist() == expected
 
@@ -98,7 +104,9 @@ def test_slices_lists_indices_and_masks_give_views(index, expected):
     assert (some.width, some.height, some.rasterize_mode) == (64, 48, "antialiased")
 
 
-@pytest.mark.parametrize(("count", "expected"), [(1, [0.0]), (2, [0.0, 4.0]), (3, [0.0, 2.0, 4.0]), (0, [])])
+@pytest.mark.parametrize(
+    ("count", "expected"), [(1, [0.0]), (2, [0.0, 4.0]), (3, [0.0, 2.0, 4.0]), (0, [])]
+)
 def test_spread_takes_evenly_from_first_to_last(count, expected):
     assert places(make().spread(count)) == expected
 

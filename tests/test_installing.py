@@ -1,7 +1,8 @@
-"""What runs where nerfstudio is missing, and so are CUDA, Node, compiled kernels, a network and a home to write to.
+"""What runs where nerfstudio is missing, and so are CUDA, Node, compiled kernels, a network and a
+home to write to.
 
-The environment has nothing but what the package asks for without an extra and what that in turn asks for, as links to
-what is installed here.
+The environment has nothing but what the package asks for without an extra and what that in turn
+asks for, as links to what is installed here.
 """
 
 import json
@@ -32,7 +33,9 @@ else:
 
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-CORE, NERFSTUDIO = ([*map(Requirement, texts)] for texts in (PROJECT["dependencies"], EXTRAS["nerfstudio"]))
+CORE, NERFSTUDIO = (
+    [*map(Requirement, texts)] for texts in (PROJECT["dependencies"], EXTRAS["nerfstudio"])
+)
 
 RUNS = {
     "--version": "pointsplat-ns",
@@ -52,7 +55,9 @@ LACKS = "compact run --photos"
 """A command that something is missing for."""
 
 
-def installed_for(requirements: Iterable[Requirement], seen: set[str] | None = None) -> Iterator[metadata.Distribution]:
+def installed_for(
+    requirements: Iterable[Requirement], seen: set[str] | None = None
+) -> Iterator[metadata.Distribution]:
     """The installed distributions that requirements ask for, and those that these ask for."""
     seen = set() if seen is None else seen
     for requirement in requirements:
@@ -64,14 +69,18 @@ def installed_for(requirements: Iterable[Requirement], seen: set[str] | None = N
         yield found
         asked = [Requirement(text) for text in found.requires or ()]
         extras = [{"extra": extra} for extra in (*requirement.extras, "")]
-        wanted = [one for one in asked if one.marker is None or any(map(one.marker.evaluate, extras))]
+        wanted = [
+            one for one in asked if one.marker is None or any(map(one.marker.evaluate, extras))
+        ]
         yield from installed_for(wanted, seen)
 
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     folder = tmp_path_factory.mktemp("bare")
-    packages, nothing, work = folder / "packages", folder / "nothing", folder / "work"
+    packages = folder / "packages"
+    nothing = folder / "nothing"
+    work = folder / "work"
     for made in (packages, nothing, work):
         made.mkdir()
     for distribution in installed_for(CORE):
@@ -95,9 +104,13 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     }
     # -S: without the site-packages of this Python.
     done = subprocess.run(
-        [sys.executable, "-S", REPOSITORY / "tests" / "support" / "bare_machine.py"], cwd=work, env=environment,
-        input=json.dumps([*map(shlex.split, lines)]), capture_output=True, text=True,
-    )  # fmt: skip
+        [sys.executable, "-S", REPOSITORY / "tests" / "support" / "bare_machine.py"],
+        cwd=work,
+        env=environment,
+        input=json.dumps([*map(shlex.split, lines)]),
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     return dict(zip(lines, json.loads(done.stdout), strict=True))
 
@@ -110,26 +123,48 @@ def test_command_runs_on_a_bare_machine(outcomes, line):
 
 
 def test_command_says_what_it_lacks_in_one_line(outcomes):
-    done, said = outcomes[LACKS], "reading the photos and poses of a run needs nerfstudio, which is not installed; "
-    assert done["status"] == 1 and done["err"].startswith("error: ") and done["err"].count("\n") == 1
+    done = outcomes[LACKS]
+    said = "reading the photos and poses of a run needs nerfstudio, which is not installed; "
+    assert (
+        done["status"] == 1 and done["err"].startswith("error: ") and done["err"].count("\n") == 1
+    )
     assert said + "pip install 'pointsplat-ns[nerfstudio]' adds it" in done["err"]
 
 
 def test_requirements_are_what_is_imported():
-    core, more = ({canonicalize_name(requirement.name) for requirement in listed} for listed in (CORE, NERFSTUDIO))
-    plugin, rest = set(), set()
-    for path in (*REPOSITORY.glob("pointsplat_ns/**/*.py"), *REPOSITORY.glob("method_configs/*.py")):
-        (plugin if {"nerfstudio_plugin", "method_configs"} & {*path.parts} else rest).update(imports_of(path))
+    core, more = (
+        {canonicalize_name(requirement.name) for requirement in listed}
+        for listed in (CORE, NERFSTUDIO)
+    )
+    plugin = set()
+    rest = set()
+    for path in (
+        *REPOSITORY.glob("pointsplat_ns/**/*.py"),
+        *REPOSITORY.glob("method_configs/*.py"),
+    ):
+        (plugin if {"nerfstudio_plugin", "method_configs"} & {*path.parts} else rest).update(
+            imports_of(path)
+        )
     homes = metadata.packages_distributions()
-    ours = {"pointsplat_ns", "method_configs", "_typeshed", "gsplat", *sys.stdlib_module_names}  # gsplat: nerfstudio's
+    ours = {
+        "pointsplat_ns",
+        "method_configs",
+        "_typeshed",
+        "gsplat",
+        *sys.stdlib_module_names,
+    }  # gsplat: nerfstudio's
 
     def distributions(imported: set[str]) -> set[str]:
         tops = {name.split(".")[0] for name in imported} - ours
         found = {canonicalize_name(name) for top in tops for name in homes[top]}
-        return found - {"opencv-python"}  # shares its package with that without a window, which nerfstudio takes
+        return found - {
+            "opencv-python"
+        }  # shares its package with that without a window, which nerfstudio takes
 
     # open3d is imported nowhere: pyproject.toml says which of its versions nerfstudio can use
-    assert distributions(rest) <= core and distributions(plugin | rest) == (core | more) - {"open3d"}
+    assert distributions(rest) <= core and distributions(plugin | rest) == (core | more) - {
+        "open3d"
+    }
 
 
 def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(monkeypatch, tmp_path):
@@ -159,7 +194,9 @@ def test_a_package_that_is_there_but_broken_keeps_its_error(monkeypatch, tmp_pat
         need("nerfstudio", "training")
 
 
-@pytest.mark.parametrize("said", [ImportError("No module"), RuntimeError("operator torchvision::nms does not exist")])
+@pytest.mark.parametrize(
+    "said", [ImportError("No module"), RuntimeError("operator torchvision::nms does not exist")]
+)
 def test_lpips_says_that_torchvision_is_missing_or_of_another_torch(said, monkeypatch):
     class Broken:
         def find_spec(self, name, path=None, target=None):
@@ -169,5 +206,7 @@ def test_lpips_says_that_torchvision_is_missing_or_of_another_torch(said, monkey
     for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(sys, "meta_path", [Broken(), *sys.meta_path])
-    with pytest.raises(LpipsUnavailable, match=f"LPIPS needs torchvision, which cannot be imported .{said}"):
+    with pytest.raises(
+        LpipsUnavailable, match=f"LPIPS needs torchvision, which cannot be imported .{said}"
+    ):
         load_lpips("alex", download=False)

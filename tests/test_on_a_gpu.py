@@ -1,5 +1,5 @@
-"""What is computed where, by a GPU that is pretended: nothing on it from several threads, no linear algebra of a few
-numbers, and the same results as on the CPU."""
+"""What is computed where, by a GPU that is pretended: nothing on it from several threads, no linear
+algebra of a few numbers, and the same results as on the CPU."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -23,13 +23,18 @@ from pointsplat_ns.system.threads import fixed_threads
 from pretend_gpu import GPU, pretend_gpu
 
 NEAR = 1e-4
-"""Difference of colours in [0, 1] in float32 between compiled kernels, which the CPU uses, and torch."""
+"""Difference of colours in [0, 1] in float32 between compiled kernels, which the CPU uses, and
+torch."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def several_threads():
-    """More than one thread for pieces of work, whatever the environment says; views are sampled from few."""
-    with fixed_threads(4), changed({"candidates_per_view": 1, "min_candidates": 4, "evidence_count": 100}):
+    """More than one thread for pieces of work, whatever the environment says; views are sampled
+    from few."""
+    with (
+        fixed_threads(4),
+        changed({"candidates_per_view": 1, "min_candidates": 4, "evidence_count": 100}),
+    ):
         yield
 
 
@@ -74,12 +79,20 @@ def test_views_on_a_gpu_are_drawn_in_the_thread_that_asks(room, views):
 def test_gradients_reach_a_viewmat_on_any_device(room, views, cameras_on, dtype):
     def gradients(device, cameras_on):
         scene = room.to(device=device, dtype=dtype)
-        leaves = [value.requires_grad_() for value in (scene.means, scene.quats, scene.stds, scene.alphas, scene.sh)]
+        leaves = [
+            value.requires_grad_()
+            for value in (scene.means, scene.quats, scene.stds, scene.alphas, scene.sh)
+        ]
         viewmats = views.viewmats.to(device=cameras_on, dtype=dtype).requires_grad_()
         image, _, _ = ps.rasterization(
-            *leaves, viewmats, views.Ks.to(device=cameras_on, dtype=dtype), views.width, views.height,
-            sh_degree=scene.sh_degree, compiled=False,
-        )  # fmt: skip
+            *leaves,
+            viewmats,
+            views.Ks.to(device=cameras_on, dtype=dtype),
+            views.width,
+            views.height,
+            sh_degree=scene.sh_degree,
+            compiled=False,
+        )
         found = torch.autograd.grad(image.square().mean(), [*leaves, viewmats])
         assert found[-1].device == viewmats.device and found[-1].dtype == dtype
         return [value.cpu() for value in found]
@@ -106,7 +119,8 @@ def test_every_method_keeps_the_same_gaussians_on_a_gpu(by, room, views):
 
 
 def test_merging_on_a_gpu_loses_as_much_as_on_the_cpu_in_the_views_that_are_sampled(views):
-    dense, counts = box_room(1, count=2500, size=0.05), (900, 250)
+    dense = box_room(1, count=2500, size=0.05)
+    counts = (900, 250)
     settings = replace(MERGING, sampled_views=3, finish_views=1)
     wanted = [merge(dense, k, settings=settings).scene for k in counts]
     with pretend_gpu() as gpu:
@@ -116,7 +130,9 @@ def test_merging_on_a_gpu_loses_as_much_as_on_the_cpu_in_the_views_that_are_samp
     assert [len(scene) for scene in found] == [*counts]
     reference = DenseReference(dense, views)
     for ours, right in zip(found, wanted, strict=True):
-        assert abs(reference.psnr(ours)[0] - reference.psnr(right)[0]) < 0.05  # dB, by rounding of costs
+        assert (
+            abs(reference.psnr(ours)[0] - reference.psnr(right)[0]) < 0.05
+        )  # dB, by rounding of costs
 
 
 def test_the_cpu_merges_what_is_too_large_for_a_gpu(room, views, monkeypatch, caplog):
@@ -128,14 +144,25 @@ def test_the_cpu_merges_what_is_too_large_for_a_gpu(room, views, monkeypatch, ca
     monkeypatch.setattr(rounds, "one_round", full)
     with pretend_gpu():
         merger = Merger(room.to(GPU), views)
-        found = [*merge_levels(room.to(GPU), [60, 50], views=views), merger.merged(60), merger.merged(50)]
-        assert {merged.scene.device for merged in found} == {GPU} and "too little memory" in caplog.text
+        found = [
+            *merge_levels(room.to(GPU), [60, 50], views=views),
+            merger.merged(60),
+            merger.merged(50),
+        ]
+        assert {merged.scene.device for merged in found} == {
+            GPU
+        } and "too little memory" in caplog.text
         found = [merged.to("cpu").scene for merged in found]
-    wanted = [*merge_levels(room, [60, 50], views=views), *(merge(room, k, views=views) for k in (60, 50))]
+    wanted = [
+        *merge_levels(room, [60, 50], views=views),
+        *(merge(room, k, views=views) for k in (60, 50)),
+    ]
     assert all(same(ours, right.scene) for ours, right in zip(found, wanted, strict=True))
 
 
-def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, views, tmp_path, monkeypatch):
+def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(
+    room, views, tmp_path, monkeypatch
+):
     """What chooses a GPU where there is one chooses the pretended one."""
     monkeypatch.setitem(STEPS, "quick", 3)
     save_refiner(small_refiner(sh_degree=1), tmp_path / "small.safetensors")
@@ -144,11 +171,19 @@ def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, views, t
     monkeypatch.setattr(trained_refiner, "default_device", lambda: GPU)
     with pretend_gpu() as gpu:
         found = ps.compact(room, 0.3, views=views)
-        refined = ps.compact(room, 0.5, ps.load_refiner(tmp_path / "small.safetensors"), effort="instant", views=views)
+        refined = ps.compact(
+            room,
+            0.5,
+            ps.load_refiner(tmp_path / "small.safetensors"),
+            effort="instant",
+            views=views,
+        )
     check(gpu)
     assert len(gpu.operations) > 1000, "renders, and steps of the repair"
     assert len(refined.scene) == 100
-    assert len(found.scene) == len(wanted.scene) and {stage.scene.device for stage in found.stages} == {room.device}
+    assert len(found.scene) == len(wanted.scene) and {
+        stage.scene.device for stage in found.stages
+    } == {room.device}
     for ours, right in zip(found.stages, wanted.stages, strict=True):
         assert ours.name == right.name and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
 
@@ -162,7 +197,8 @@ def test_trainings_take_the_same_steps_on_a_gpu_from_one_thread(
         if method == "pointsplat":  # scenes are sampled, pruned and drawn
             config = dense_config(rooms, folder, steps=2)
             config.pipeline.datamanager.sampled_poses = 2
-            config.pipeline.model.by, config.steps_per_eval_image = "merge", 0
+            config.pipeline.model.by = "merge"
+            config.steps_per_eval_image = 0
         else:
             config = wall_config(wall_scene, folder, 12)  # densification is in them
         config.machine.device_type = device.type

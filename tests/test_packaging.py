@@ -15,14 +15,20 @@ import pytest
 import pointsplat_ns as ps
 from making import REPOSITORY, ball, imports_of
 
-pytestmark = pytest.mark.xdist_group("packaging")  # one process builds and installs for all tests of this file
+pytestmark = pytest.mark.xdist_group(
+    "packaging"
+)  # one process builds and installs for all tests of this file
 
 
 def run(*command: str | Path, cwd: Path, **variables: str) -> str:
     """Run a command and give what it printed; the test fails with its words if it does."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))
+    }
     environment |= {"OMP_NUM_THREADS": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1", **variables}
-    done = subprocess.run(list(map(str, command)), cwd=cwd, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        list(map(str, command)), cwd=cwd, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -39,7 +45,8 @@ def tracked_files() -> list[str]:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
+    source = tmp_path_factory.mktemp("source")
+    out = tmp_path_factory.mktemp("dist")
     for name in tracked_files():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(REPOSITORY / name, source / name)
@@ -59,29 +66,44 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     environment = tmp_path_factory.mktemp("installed")
     run(sys.executable, "-m", "venv", "--without-pip", environment, cwd=environment)
     [packages] = (environment / "lib").glob("python*/site-packages")
-    # A folder that a .pth file names is searched for modules, but .pth files in it are not read: what installs this
-    # package editably is one of those.
+    # A folder that a .pth file names is searched for modules, but .pth files in it are not read:
+    # what installs this package editably is one of those.
     (packages / "dependencies.pth").write_text(f"{sysconfig.get_paths()['purelib']}\n")
     pip = (sys.executable, "-m", "pip", "--python", environment / "bin" / "python")
-    run(*pip, "install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=environment)
+    run(
+        *pip,
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--ignore-installed",
+        wheel,
+        cwd=environment,
+    )
     return environment
 
 
 def test_wheel_holds_every_file_of_the_packages_but_their_documentation(wheel):
-    packaged = [name for name in tracked_files() if name.startswith(("pointsplat_ns/", "method_configs/"))]
+    packaged = [
+        name for name in tracked_files() if name.startswith(("pointsplat_ns/", "method_configs/"))
+    ]
     wanted = {name for name in packaged if not name.endswith((".md", ".svg"))}
     wanted.add("pointsplat_ns/refiner/pretrained/CARD.md")  # goes with the weights
     with zipfile.ZipFile(wheel) as archive:
         held = {info.filename: info.file_size for info in archive.infolist()}
     assert len(wanted) > 100
-    assert {name: held.get(name) for name in wanted} == {name: (REPOSITORY / name).stat().st_size for name in wanted}
+    assert {name: held.get(name) for name in wanted} == {
+        name: (REPOSITORY / name).stat().st_size for name in wanted
+    }
 
 
 def test_wheel_asks_for_nerfstudio_in_an_extra_alone(wheel):
     with zipfile.ZipFile(wheel) as archive:
         [name] = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
         lines = archive.read(name).decode().splitlines()
-    asked = [line.removeprefix("Requires-Dist: ") for line in lines if line.startswith("Requires-Dist: ")]
+    asked = [
+        line.removeprefix("Requires-Dist: ") for line in lines if line.startswith("Requires-Dist: ")
+    ]
     alone = {re.split(r"[^\w-]", line)[0] for line in asked if "extra ==" not in line}
     assert "torch" in alone and not alone & {"nerfstudio", "open3d", "opencv-python-headless"}
     assert [line for line in asked if line.startswith("nerfstudio")] == [
@@ -96,7 +118,9 @@ groups = [importlib.metadata.entry_points(group=f"nerfstudio.{kind}_configs") fo
 names = sorted({point.name for group in groups for point in group})
 print(json.dumps([pointsplat_ns.__file__, kernels.KERNELS.why_missing, names]))
 """
-    where, why_missing, names = json.loads(run(installed / "bin" / "python", "-c", code, cwd=installed))
+    where, why_missing, names = json.loads(
+        run(installed / "bin" / "python", "-c", code, cwd=installed)
+    )
     assert Path(where).is_relative_to(installed)
     assert why_missing == "" or not any(map(shutil.which, ("c++", "g++")))
     methods = ["pointsplat", "pointsplat-authors", "pointsplat-paper", "splatfacto-cpu"]
@@ -105,13 +129,24 @@ print(json.dumps([pointsplat_ns.__file__, kernels.KERNELS.why_missing, names]))
 
 def test_installed_compact_finds_the_refiner_that_ships(installed):
     ps.save(ball(300), installed / "room.ply")
-    run(installed / "bin" / "pointsplat", "compact", "room.ply", "--keep", "20%", "--effort", "instant", cwd=installed)
+    run(
+        installed / "bin" / "pointsplat",
+        "compact",
+        "room.ply",
+        "--keep",
+        "20%",
+        "--effort",
+        "instant",
+        cwd=installed,
+    )
     assert len(ps.load(installed / "room_compact.ply")) == 60
 
 
 def modules_after(code: str) -> set[str]:
     words = f"import sys, json; before = set(sys.modules)\n{code}\nprint(json.dumps(sorted(set(sys.modules) - before)))"
-    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, cwd=REPOSITORY)
+    done = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, cwd=REPOSITORY
+    )
     assert done.returncode == 0, done.stderr
     return set(json.loads(done.stdout))
 
@@ -132,16 +167,28 @@ ps.save(result.scene, {str(tmp_path / "small.ply")!r})
 """
     imported = {name.split(".")[0] for name in modules_after(code)}
     assert "torch" in imported
-    assert imported & {"nerfstudio", "gsplat", "torchvision", "matplotlib", "method_configs", "tyro"} == set()
+    assert (
+        imported & {"nerfstudio", "gsplat", "torchvision", "matplotlib", "method_configs", "tyro"}
+        == set()
+    )
 
 
 def test_neither_the_lab_nor_tests_nor_mocks_are_imported_by_the_package():
-    names = {name.split(".")[0] for path in REPOSITORY.glob("pointsplat_ns/**/*.py") for name in imports_of(path)}
+    names = {
+        name.split(".")[0]
+        for path in REPOSITORY.glob("pointsplat_ns/**/*.py")
+        for name in imports_of(path)
+    }
     assert names & {"lab", "tests", "making", "unittest", "mock", "pytest"} == set()
 
 
 def test_tests_that_ci_names_are_there():
     """pytest runs none if one of its paths is missing."""
-    words = (REPOSITORY / ".github" / "workflows" / "ci.yml").read_text("utf-8").replace('"', " ").split()
+    words = (
+        (REPOSITORY / ".github" / "workflows" / "ci.yml")
+        .read_text("utf-8")
+        .replace('"', " ")
+        .split()
+    )
     named = {word.partition("::")[0] for word in words if word.startswith("tests/")}
     assert len(named) > 10 and [name for name in named if not (REPOSITORY / name).exists()] == []

@@ -1,4 +1,5 @@
-"""The same again, on one thread and on several: the same selection, the same repair and the same bytes."""
+"""The same again, on one thread and on several: the same selection, the same repair and the same
+bytes."""
 
 import pytest
 
@@ -30,10 +31,14 @@ def test_a_scene_is_made_small_to_the_same_bits_on_one_thread_and_on_two(by, roo
         assert same_bits(first, ps.prune(room, 0.3, by=by, views=views))
 
 
-@pytest.mark.skipif(bool(KERNELS.why_missing), reason="without kernels, threads add up gradients in another order")
+@pytest.mark.skipif(
+    bool(KERNELS.why_missing), reason="without kernels, threads add up gradients in another order"
+)
 def test_a_repair_has_the_same_bits_on_any_number_of_threads(room, monkeypatch):
     monkeypatch.setitem(STEPS, "quick", 8)
-    small, source, found = ps.prune(room, 0.3), ViewSource(room, given=ps.sample_views(room, 24, 64, 48)), []
+    small = ps.prune(room, 0.3)
+    source = ViewSource(room, given=ps.sample_views(room, 24, 64, 48))
+    found = []
     for count in (1, 2, 3):
         with fixed_threads(count):
             found.append(repair(small, room, source, RepairBudget("quick")).scene)

@@ -22,7 +22,13 @@ def test_rows_that_look_wrong_are_counted():
     scene.quats[2] = 0
     scene.opacities[3] = math.inf
     scene.opacities[4] = -20.0
-    kinds = ("NaN", "infinite", "opacity of exactly 0 or 1", "too faint to be drawn", "zero quaternion")
+    kinds = (
+        "NaN",
+        "infinite",
+        "opacity of exactly 0 or 1",
+        "too faint to be drawn",
+        "zero quaternion",
+    )
     assert ps.info(scene).suspicious == dict.fromkeys(kinds, 1)
     assert ps.info(cloud(50).replace(opacities=torch.zeros(50, 1))).suspicious == {}
 
@@ -39,7 +45,12 @@ def test_rows_of_a_file_that_cannot_be_drawn_are_counted_too(tmp_path):
 
 def test_the_file_its_format_and_its_size_are_named(tmp_path):
     scene = cloud(300)
-    for suffix, name in {".ply": "3DGS PLY", ".spz": "SPZ", ".sog": "SOG", ".splat": "splat"}.items():
+    for suffix, name in {
+        ".ply": "3DGS PLY",
+        ".spz": "SPZ",
+        ".sog": "SOG",
+        ".splat": "splat",
+    }.items():
         path = tmp_path / f"a{suffix}"
         ps.save(scene, path)
         found = ps.info(path)
@@ -54,10 +65,14 @@ def test_the_file_its_format_and_its_size_are_named(tmp_path):
 
 
 def test_up_is_named_or_estimated_and_fill_is_that_of_the_views():
-    scene, view = ps.example_room()[::100], {"resolution": "64x48"}
-    found, named = ps.info(scene, **view), ps.info(scene, up="-y", **view)
+    scene = ps.example_room()[::100]
+    view = {"resolution": "64x48"}
+    found = ps.info(scene, **view)
+    named = ps.info(scene, up="-y", **view)
     assert found.up_text.startswith("z") and found.up == [0, 0, 1]
     assert named.up_text == "-y" and not named.up_is_guess
     views = ViewSource(scene, resolution=(64, 48), up=up_named("-y")).views(12)
-    assert named.fill == pytest.approx(fill(scene, views)) and named.fill != pytest.approx(found.fill)
+    assert named.fill == pytest.approx(fill(scene, views)) and named.fill != pytest.approx(
+        found.fill
+    )
     assert named.views == f"{len(views)} views of 64 x 48 pixels"

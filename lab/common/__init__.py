@@ -1,1 +1,2 @@
-"""What several programs of the lab share: lists of scenes, comparison of pictures, clocks, results, tables."""
+"""What several programs of the lab share: lists of scenes, comparison of pictures, clocks, results,
+tables."""

@@ -21,21 +21,25 @@ METRICS = ("psnr", "ssim", "lpips")
 def dataset_photos(
     path: Path | str, split: Literal["train", "test"], count: int, data: Path | str | None = None
 ) -> tuple[Views, list[Tensor]]:
-    """At most ``count`` photos (H, W, 3) in [0, 1] of a run's dataset, evenly spread, and their views on the CPU."""
+    """At most ``count`` photos (H, W, 3) in [0, 1] of a run's dataset, evenly spread, and their
+    views on the CPU."""
     views, photos, _ = photos_of_one_size(run_photos(path, split, data), count)
     return views, [photo.target for photo in photos]
 
 
-def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[str, Views, list[Tensor]]:
-    """The run's name, and at most ``count`` photos (H, W, 3) of a split, evenly spread, with the views that they show
-    once undistorted."""
+def photos_of(
+    path: Path, split: Literal["train", "test"], count: int
+) -> tuple[str, Views, list[Tensor]]:
+    """The run's name, and at most ``count`` photos (H, W, 3) of a split, evenly spread, with the
+    views that they show once undistorted."""
     views, photos = dataset_photos(path, split, count)
     return scene_name(open_run(path)), views, photos
 
 
 @torch.no_grad()
 def metrics_of(image: Tensor, target: Tensor, lpips: Lpips | None) -> dict[str, float]:
-    """The :data:`METRICS` of one picture (H, W, 3) against another; without LPIPS where there is no network."""
+    """The :data:`METRICS` of one picture (H, W, 3) against another; without LPIPS where there is no
+    network."""
     found = {"psnr": finite_psnr(image, target), "ssim": float(ssim(image, target))}
     return found if lpips is None else found | {"lpips": float(lpips(image, target))}
 

@@ -19,7 +19,8 @@ WIDE = 240
 
 
 def start(program: Callable[..., Any]) -> Any:
-    """Run a function with the arguments of the command line; input that cannot be used ends it with one line."""
+    """Run a function with the arguments of the command line; input that cannot be used ends it with
+    one line."""
     from pointsplat_ns.errors import PointSplatError
 
     try:
@@ -33,7 +34,9 @@ def console() -> Console:
     return Console(width=None if sys.stdout.isatty() else WIDE)
 
 
-def table(title: str, heads: Sequence[str], rows: Iterable[Sequence[object]], left: Iterable[str] = ()) -> Table:
+def table(
+    title: str, heads: Sequence[str], rows: Iterable[Sequence[object]], left: Iterable[str] = ()
+) -> Table:
     """A table for the console; the first column and those of ``left`` start at the left."""
     shown = Table(title=title)
     for i, head in enumerate(heads):
@@ -56,7 +59,8 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def number(digits: int, scale: float = 1.0, sign: str = "") -> Callable[[float | None], str]:
-    """How a column writes its numbers: digits after the point, a factor first, "+" for a sign always, a dash for None.
+    """How a column writes its numbers: digits after the point, a factor first, "+" for a sign
+    always, a dash for None.
 
     >>> number(1, 1e3)(0.0123), number(2)(None)
     ('12.3', '-')

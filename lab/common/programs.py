@@ -28,8 +28,8 @@ found = {"exit": os.waitstatus_to_exitcode(status), "seconds": seconds,
 with open(sys.argv[1], "w") as stream:
     json.dump(found, stream)
 """
-"""Starts a program and waits for it, in a small interpreter of its own: on Linux a process begins with the peak memory
-of the one that started it, which is one that holds scenes."""
+"""Starts a program and waits for it, in a small interpreter of its own: on Linux a process begins
+with the peak memory of the one that started it, which is one that holds scenes."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class ProgramFailed(PointSplatError):
 
 
 def run_measured(args: Sequence[str], timeout: float | None = None) -> Usage:
-    """Run a program to its end, without a shell; what it prints is kept for the error. After ``timeout`` seconds it is
-    ended, with all that it started. Raises ProgramFailed if it cannot be started, is killed, takes too long or ends
-    with another status than 0.
+    """Run a program to its end, without a shell; what it prints is kept for the error. After
+    ``timeout`` seconds it is ended, with all that it started. Raises ProgramFailed if it cannot be
+    started, is killed, takes too long or ends with another status than 0.
 
     Example:
         >>> run_measured([sys.executable, "-c", "pass"]).seconds > 0
@@ -69,11 +69,18 @@ def run_measured(args: Sequence[str], timeout: float | None = None) -> Usage:
 
 
 def _run(args: Sequence[str], name: str, timeout: float | None) -> tuple[int, str]:
-    """The exit status of a program and what it printed. Whatever ends the wait, nothing that it started is left."""
+    """The exit status of a program and what it printed. Whatever ends the wait, nothing that it
+    started is left."""
     pipe = subprocess.PIPE
     # A session of its own, so that it can be ended together with the programs that it starts.
     with subprocess.Popen(
-        args, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True, errors="replace", start_new_session=True
+        args,
+        stdin=subprocess.DEVNULL,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        errors="replace",
+        start_new_session=True,
     ) as process:
         try:
             printed, complained = process.communicate(timeout=timeout)

@@ -1,4 +1,5 @@
-"""Results as JSON: whole files, and rows that are written after each scene and can be taken up again."""
+"""Results as JSON: whole files, and rows that are written after each scene and can be taken up
+again."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Ro
 
 
 def write_json(path: Path | None, content: Any) -> None:
-    """Write a JSON file whole or not at all, with null for numbers that are not finite; no path, no file."""
+    """Write a JSON file whole or not at all, with null for numbers that are not finite; no path, no
+    file."""
     if path is not None:
         with replacing(path) as part:
             part.write_text(json_text(content) + "\n", "utf-8")
@@ -46,20 +48,28 @@ class Results:
     """
 
     def __init__(self, path: Path | None, settings: dict[str, Any], resume: bool):
-        self.path, self.settings = path, json.loads(json.dumps(settings))
+        self.path = path
+        self.settings = json.loads(json.dumps(settings))
         self.rows: list[Row] = []
         if resume and path is None:
             raise SystemExit("--resume without --json; expected the file to take up")
         if resume and path is not None and path.exists():
             try:
                 content = json.loads(path.read_text("utf-8"))
-                self.rows, known = content["rows"], content["settings"]
+                self.rows = content["rows"]
+                known = content["settings"]
             except (OSError, ValueError, KeyError, TypeError) as error:
-                raise SystemExit(f"{path}: cannot be taken up ({error!r}); give another --json") from error
+                raise SystemExit(
+                    f"{path}: cannot be taken up ({error!r}); give another --json"
+                ) from error
             other = [name for name in self.settings if self.settings[name] != known.get(name)]
             if other:
-                found = ", ".join(f"{name} {known.get(name)}, now {self.settings[name]}" for name in other)
-                raise SystemExit(f"{path}: was written with {found}; expected the same, or another --json")
+                found = ", ".join(
+                    f"{name} {known.get(name)}, now {self.settings[name]}" for name in other
+                )
+                raise SystemExit(
+                    f"{path}: was written with {found}; expected the same, or another --json"
+                )
 
     def of(self, name: str) -> list[Row]:
         """The rows of a scene that are there."""

@@ -15,8 +15,8 @@ from pointsplat_ns.nerfstudio_plugin.registration import JIT_SCRIPT
 
 
 def run(command: str, log: Path, show_errors: bool = False, **variables: str) -> None:
-    """Print a command and run it, with the program from this Python's environment. If this is interrupted, the command
-    is ended first.
+    """Print a command and run it, with the program from this Python's environment. If this is
+    interrupted, the command is ended first.
 
     Args:
         command: the command line.
@@ -31,20 +31,32 @@ def run(command: str, log: Path, show_errors: bool = False, **variables: str) ->
     program, *arguments = shlex.split(command)
     beside = Path(sys.executable).parent / program
     words = [str(beside) if beside.exists() else program, *arguments]
-    # Waiting OpenMP threads spin for some microseconds, then sleep. By default they keep spinning, which on a busy
-    # machine slows the thread that they wait for. Threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late.
-    environment = {"GOMP_SPINCOUNT": "20000", "PYTHONWARNINGS": JIT_SCRIPT, **variables, **os.environ}
+    # Waiting OpenMP threads spin for some microseconds, then sleep. By default they keep spinning,
+    # which on a busy machine slows the thread that they wait for. Threads that sleep at once
+    # (OMP_WAIT_POLICY=PASSIVE) wake too late.
+    environment = {
+        "GOMP_SPINCOUNT": "20000",
+        "PYTHONWARNINGS": JIT_SCRIPT,
+        **variables,
+        **os.environ,
+    }
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as stream:
-        status = _status(words, env=environment, stdout=stream, stderr=None if show_errors else subprocess.STDOUT)
+        status = _status(
+            words, env=environment, stdout=stream, stderr=None if show_errors else subprocess.STDOUT
+        )
     if status != 0:
         where = "above and in" if show_errors else "in"
-        raise PointSplatError(f"{command}: ended with exit status {status}; what it said is {where} {log}")
+        raise PointSplatError(
+            f"{command}: ended with exit status {status}; what it said is {where} {log}"
+        )
 
 
 def _status(words: list[str], **options: Any) -> int:
-    """Run a program until it ends, and give its exit status. It does not outlive an exception here."""
-    # A session of its own: Ctrl-C would reach it twice, and a training saves its last step on the first signal alone.
+    """Run a program until it ends, and give its exit status. It does not outlive an exception
+    here."""
+    # A session of its own: Ctrl-C would reach it twice, and a training saves its last step on the
+    # first signal alone.
     with subprocess.Popen(words, start_new_session=True, **options) as process:
         try:
             return process.wait()
@@ -67,10 +79,19 @@ def train_refiner_command(
     options: Mapping[str, Any],
     method: str,
 ) -> str:
-    """The command that trains a refiner on all scenes below the folder ``scenes``, but for those named in
-    ``eval_scenes``, by a method or a preset of it. The run goes to :func:`folder_of_run`; ``options`` are further ones
-    of the method, without their dashes."""
-    words = ["ns-train", method, "--vis", "tensorboard", "--timestamp", timestamp, "--output-dir", str(output)]
+    """The command that trains a refiner on all scenes below the folder ``scenes``, but for those
+    named in ``eval_scenes``, by a method or a preset of it. The run goes to :func:`folder_of_run`;
+    ``options`` are further ones of the method, without their dashes."""
+    words = [
+        "ns-train",
+        method,
+        "--vis",
+        "tensorboard",
+        "--timestamp",
+        timestamp,
+        "--output-dir",
+        str(output),
+    ]
     words += ["--experiment-name", name, "--max-num-iterations", str(steps), "--data", str(scenes)]
     if eval_scenes:
         words += ["--pipeline.datamanager.eval-scenes", *eval_scenes]

@@ -11,17 +11,40 @@ from pointsplat_ns.io import open_run, scene_name
 
 TUNING = (
     *("apt_bathroom", "bouquet", "pc_flowers", "pc_statue_massa", "plant_pilea", "kettle_pod"),
-    *("pc_statue_angel", "pc_statue_narcissus", "pc_statue_trumpet", "kitchen", "fox", "final_3dgs", "vr_project"),
+    *(
+        "pc_statue_angel",
+        "pc_statue_narcissus",
+        "pc_statue_trumpet",
+        "kitchen",
+        "fox",
+        "final_3dgs",
+        "vr_project",
+    ),
     *("room", "room5", "meeting", "drone_hall", "figure", "ray", "headquarter_garden"),
 )
 """Scenes that constants may be chosen on."""
 
 JUDGED = (
-    *("apt_kitchen_balcony", "cake_fraisier", "mujoco_tabletop", "pc_playbot", "rock", "pc_statue_angel_kneeling"),
-    *("pc_statue_angel_with_candlestick", "pc_statue_st_peter", "lounge", "diorama", "ethiopianHead", "dataset_perso"),
+    *(
+        "apt_kitchen_balcony",
+        "cake_fraisier",
+        "mujoco_tabletop",
+        "pc_playbot",
+        "rock",
+        "pc_statue_angel_kneeling",
+    ),
+    *(
+        "pc_statue_angel_with_candlestick",
+        "pc_statue_st_peter",
+        "lounge",
+        "diorama",
+        "ethiopianHead",
+        "dataset_perso",
+    ),
     *("lego_dense", "taebak", "office", "room35", "chair", "plant", "phone", "can"),
 )
-"""Scenes that no constant is chosen on: they were named before the first measurement. See docs/benchmarks.md."""
+"""Scenes that no constant is chosen on: they were named before the first measurement. See
+docs/benchmarks.md."""
 
 
 def group_of(scene: str) -> str:
@@ -49,4 +72,6 @@ def room(count: int, sh_degree: int = 3, seed: int = 0) -> Gaussians:
     scales = 0.6 * (108 / count) ** 0.5 * torch.exp(0.7 * torch.randn(count, 3, generator=g))
     opacities = 0.05 + 0.9 * torch.rand(count, generator=g)
     sh = 0.1 * torch.randn(count, (sh_degree + 1) ** 2, 3, generator=g)
-    return Gaussians(means, scales.log(), quats, opacities.logit()[:, None], sh[:, 0].clone(), sh[:, 1:].clone())
+    return Gaussians(
+        means, scales.log(), quats, opacities.logit()[:, None], sh[:, 0].clone(), sh[:, 1:].clone()
+    )

@@ -14,7 +14,8 @@ _clock = time.perf_counter
 
 
 def use_cpu_time() -> None:
-    """From now on the clock counts CPU seconds of this process, which others on the machine do not stretch."""
+    """From now on the clock counts CPU seconds of this process, which others on the machine do not
+    stretch."""
     global _clock
     _clock = time.process_time
 
@@ -33,14 +34,17 @@ def seconds_of(call: Callable[[], object]) -> float:
     return now() - start
 
 
-def timed(functions: dict[Any, Callable[[], dict[Any, float]]], repeats: int, budget: float) -> dict[Any, float]:
-    """Call every function once a round and take medians, so that a busy moment of the machine hits all alike.
+def timed(
+    functions: dict[Any, Callable[[], dict[Any, float]]], repeats: int, budget: float
+) -> dict[Any, float]:
+    """Call every function once a round and take medians, so that a busy moment of the machine hits
+    all alike.
 
     Args:
         functions: each measures itself and returns seconds by name.
         repeats: rounds counted; one more comes before them, to warm up.
-        budget: seconds after which no new round is begun. At least one round is counted: the first if it alone
-            took more than half of the budget.
+        budget: seconds after which no new round is begun. At least one round is counted: the first
+            if it alone took more than half of the budget.
     """
     begin = time.perf_counter()
     rounds: list[dict[Any, float]] = []

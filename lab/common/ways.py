@@ -41,10 +41,13 @@ class Reducer:
     command: Callable[[Path, int, Path], list[str]]
     """The command line for a PLY to read, a number of Gaussians, and a PLY to write."""
 
-    def reduce(self, source: Path, count: int, timeout: float | None = None) -> tuple[Gaussians, Usage]:
-        """Run the program on a PLY, to keep ``count`` Gaussians: the smaller scene, and the cost with reading and
-        writing. No file is left beside the PLY. Raises ProgramFailed if it fails, takes longer than ``timeout`` seconds
-        or writes no file, and SceneError if its file cannot be read."""
+    def reduce(
+        self, source: Path, count: int, timeout: float | None = None
+    ) -> tuple[Gaussians, Usage]:
+        """Run the program on a PLY, to keep ``count`` Gaussians: the smaller scene, and the cost
+        with reading and writing. No file is left beside the PLY. Raises ProgramFailed if it fails,
+        takes longer than ``timeout`` seconds or writes no file, and SceneError if its file cannot
+        be read."""
         with tempfile.TemporaryDirectory(dir=source.parent) as folder:
             target = Path(folder) / "small.ply"
             args = self.command(source, count, target)
@@ -60,11 +63,12 @@ class SplatTransform:
     Attributes:
         version: such as "3.7.0".
         missing: the reason why it cannot be run; empty if it can.
-        modes: its modes of decimation: ``--decimate``, and from version 3 on ``--decimate-adaptive``.
+        modes: its modes of decimation: ``--decimate``, and from version 3 on
+            ``--decimate-adaptive``.
 
     Args:
-        program: the path of the program; by default the one of this name on PATH. npx would run one of the current
-            folder, which may be a stranger's.
+        program: the path of the program; by default the one of this name on PATH. npx would run one
+            of the current folder, which may be a stranger's.
     """
 
     def __init__(self, program: str | None = None):
@@ -74,14 +78,23 @@ class SplatTransform:
         self.modes: tuple[Reducer, ...] = ()
         try:
             found = subprocess.run(
-                [*self.command, "--version"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120
+                [*self.command, "--version"],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=120,
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             self.missing = f"{self.command[0]}: {error.__class__.__name__}"
             return
-        version = re.search(r"(?:^|\s)v((\d{1,6})\.[\w.+-]{1,40})(?=\s|$)", found.stdout + found.stderr)
+        version = re.search(
+            r"(?:^|\s)v((\d{1,6})\.[\w.+-]{1,40})(?=\s|$)", found.stdout + found.stderr
+        )
         if found.returncode != 0 or version is None:
-            self.missing = f"{' '.join(self.command)} ended with {found.returncode}; is Node's package installed?"
+            self.missing = (
+                f"{' '.join(self.command)} ended with {found.returncode}; is Node's package "
+                "installed?"
+            )
             return
         self.version = version[1]
         label = f"{name} {self.version}"
@@ -109,7 +122,9 @@ def programs_of(ways: tuple[Way, ...], splat_transform: tuple[str, ...]) -> list
         found = SplatTransform(path)
         if found.missing:
             raise SystemExit(f"{PEER}: {found.missing}")
-        programs += [mode for mode in found.modes if mode.label not in [known.label for known in programs]]
+        programs += [
+            mode for mode in found.modes if mode.label not in [known.label for known in programs]
+        ]
     return programs
 
 
@@ -125,4 +140,6 @@ def pointsplat_command(way: Way, source: Path, keep: str, target: Path) -> list[
 
 
 def _pointsplat(way: Way) -> Reducer:
-    return Reducer(way, lambda source, count, target: pointsplat_command(way, source, str(count), target))
+    return Reducer(
+        way, lambda source, count, target: pointsplat_command(way, source, str(count), target)
+    )

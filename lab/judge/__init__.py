@@ -1,1 +1,2 @@
-"""The judge: what pruned and compacted scenes lose in views that were written by hand, and in held-out photos."""
+"""The judge: what pruned and compacted scenes lose in views that were written by hand, and in
+held-out photos."""

@@ -1,12 +1,15 @@
-"""What each setting of merging is worth: scenes are merged with the defaults, and with variants that turn rules off.
+"""What each setting of merging is worth: scenes are merged with the defaults, and with variants
+that turn rules off.
 
     python -m lab.judge.ablation scenes/bouquet.ply RUN --json ablation.json --resume
     python -m lab.judge.ablation scenes/bouquet.ply --variants no_regrouping neighbours_8 --keep 0.1
-    python -m lab.judge.ablation --write ablation.json               # docs/record/ablation.md, from one file or several
+    python -m lab.judge.ablation --write ablation.json               # docs/record/ablation.md, from
+    one file or several
 
-A PLY is looked at along the camera path of its name in ``lab/judge/paths``, a Splatfacto run from the poses of its
-held-out photos. A run is merged twice: without poses, and with those of its training photos. Choose constants on scenes
-for tuning (``python -m lab.judge.judge --list``). A new variant is one line in :data:`VARIANTS`.
+A PLY is looked at along the camera path of its name in ``lab/judge/paths``, a Splatfacto run from
+the poses of its held-out photos. A run is merged twice: without poses, and with those of its
+training photos. Choose constants on scenes for tuning (``python -m lab.judge.judge --list``). A new
+variant is one line in :data:`VARIANTS`.
 """
 
 from __future__ import annotations
@@ -76,7 +79,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 :class:`~pointsplat_ns.merging.MergeSettings`."""
 
 POSES = "photos, poses given"
-"""In place of a width: the poses of held-out photos, where merging is given those of the training photos."""
+"""In place of a width: the poses of held-out photos, where merging is given those of the training
+photos."""
 
 LITTLE = 0.1
 """Mean change in dB below which a variant has no row."""
@@ -107,7 +111,8 @@ Within {little:g} dB on average: {still}.{moved}
 """
 
 Task = tuple[int | str, float, str]
-"""``at`` of a row (where the result is looked at, and whether poses are given), the share to keep, the variant."""
+"""``at`` of a row (where the result is looked at, and whether poses are given), the share to keep,
+the variant."""
 
 
 def changes_of(name: str) -> dict[str, Any]:
@@ -118,7 +123,11 @@ def changes_of(name: str) -> dict[str, Any]:
 def settings_of(views: int, width: int) -> dict[str, Any]:
     """What rows depend on beside what they name themselves."""
     values = {f"merging.{name}": value for name, value in vars(MERGING).items()}
-    return {"views": views, "width": width} | values | {f"looking.{name}": v for name, v in vars(LOOKING).items()}
+    return (
+        {"views": views, "width": width}
+        | values
+        | {f"looking.{name}": v for name, v in vars(LOOKING).items()}
+    )
 
 
 @contextmanager
@@ -126,13 +135,19 @@ def applied(changes: dict[str, Any]) -> Iterator[MergeSettings]:
     """Settings of merging with changes. Those of looking are changed while the context is open."""
     looking = {name: value for name, value in changes.items() if name in vars(LOOKING)}
     with changed(looking):
-        yield dataclasses.replace(MERGING, **{name: v for name, v in changes.items() if name not in looking})
+        yield dataclasses.replace(
+            MERGING, **{name: v for name, v in changes.items() if name not in looking}
+        )
 
 
 def current(rows: list[Row]) -> list[Row]:
     """The rows of the defaults, and of variants that there are still, with the same changes."""
     known = {BASELINE, *VARIANTS}
-    return [row for row in rows if row["method"] in known and row["changes"] == changes_of(row["method"])]
+    return [
+        row
+        for row in rows
+        if row["method"] in known and row["changes"] == changes_of(row["method"])
+    ]
 
 
 def key(row: Row) -> Task:
@@ -146,7 +161,9 @@ def warm_up() -> None:
     merge(room(3_000), 300)
 
 
-def measure(scene: JudgedScene, path: Path, tasks: list[Task], results: Results, rows: dict[Task, Row]) -> None:
+def measure(
+    scene: JudgedScene, path: Path, tasks: list[Task], results: Results, rows: dict[Task, Row]
+) -> None:
     """Measure tasks, and write the rows of the scene after each.
 
     Args:
@@ -160,22 +177,34 @@ def measure(scene: JudgedScene, path: Path, tasks: list[Task], results: Results,
     warm_up()
     dense = DenseViews(scene.dense, scene.looks[0].views)
     for at, keep, name in tracked(tasks, f"{scene.name}: merged and compared", len(tasks)):
-        views, begin = poses if at == POSES else None, time.process_time()
+        views = poses if at == POSES else None
+        begin = time.process_time()
         with applied(VARIANTS.get(name, {})) as settings:
-            small = merge(scene.dense, count_of(keep, len(scene.dense)), views=views, settings=settings).scene
+            small = merge(
+                scene.dense, count_of(keep, len(scene.dense)), views=views, settings=settings
+            ).scene
         seconds = time.process_time() - begin
-        row: Row = {"scene": scene.name, "digest": scene.digest, "gaussians": len(scene.dense), "at": at, "keep": keep}
+        row: Row = {
+            "scene": scene.name,
+            "digest": scene.digest,
+            "gaussians": len(scene.dense),
+            "at": at,
+            "keep": keep,
+        }
         row |= {"method": name, "changes": changes_of(name)}
         rows[at, keep, name] = row | {"covered_psnr": dense.psnr(small), "cpu_seconds": seconds}
         results.put(scene.name, list(rows.values()))
 
 
 def table_of(rows: list[Row]) -> pd.DataFrame:
-    """Changes in dB and CPU seconds of each variant and budget, by scene and poses, the largest loss first."""
+    """Changes in dB and CPU seconds of each variant and budget, by scene and poses, the largest
+    loss first."""
     table = pd.DataFrame(current(rows))
     place = ["scene", "at", "keep"]
     defaults = table[table["method"] == BASELINE].set_index(place)[["covered_psnr", "cpu_seconds"]]
-    found = table[table["method"] != BASELINE].join(defaults, on=place, rsuffix="_default", how="inner")
+    found = table[table["method"] != BASELINE].join(
+        defaults, on=place, rsuffix="_default", how="inner"
+    )
     found["change"] = found["covered_psnr"] - found["covered_psnr_default"]
     found["mean"] = found.groupby("method")["change"].transform("mean")
     return found.sort_values(["mean", "method"], kind="stable")
@@ -183,18 +212,25 @@ def table_of(rows: list[Row]) -> pd.DataFrame:
 
 def variant_table(found: pd.DataFrame, settings: dict[str, Any]) -> tuple[str, list[str]]:
     """A row for each variant that changes much, or other views, and the names of the others."""
-    keeps, lines, still = sorted(found["keep"].unique()), [], []
+    keeps = sorted(found["keep"].unique())
+    lines = []
+    still = []
     for name, same in found.groupby("method", sort=False):
         if name != "other_views" and (same.groupby("keep")["change"].mean().abs() < LITTLE).all():
             still.append(str(name))
             continue
         changes = changes_of(str(name))
         known = {name.partition(".")[2]: value for name, value in settings.items()}
-        moves = (f"`{field}` {_value(known.get(field))} to {_value(value)}" for field, value in changes.items())
+        moves = (
+            f"`{field}` {_value(known.get(field))} to {_value(value)}"
+            for field, value in changes.items()
+        )
         cells = []
         for keep in keeps:
             some = same.loc[same["keep"] == keep, "change"]
-            cells.append(f"{some.mean():+.2f} ({some.min():+.2f}…{some.max():+.2f})" if len(some) else "-")
+            cells.append(
+                f"{some.mean():+.2f} ({some.min():+.2f}…{some.max():+.2f})" if len(some) else "-"
+            )
         ratio = same["cpu_seconds"].sum() / same["cpu_seconds_default"].sum()
         lines.append([f"`{name}`", "; ".join(moves), *cells, f"{ratio:.2f}"])
     return markdown(["variant", "change", *map(percent, keeps), "CPU"], lines), still
@@ -204,20 +240,32 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
     """The page of all tables."""
     base = pd.DataFrame([row for row in current(rows) if row["method"] == BASELINE])
     where = {PHOTOS: "held-out photos", POSES: "held-out photos, poses given"}
-    keeps, lines = sorted(base["keep"].unique()), []
+    keeps = sorted(base["keep"].unique())
+    lines = []
     for (scene, count, at), same in base.groupby(["scene", "gaussians", base["at"].astype(str)]):
         psnr = same.set_index("keep")["covered_psnr"]
         cells = [f"{psnr[keep]:.2f}" if keep in psnr else "-" for keep in keeps]
-        lines.append([f"{scene} ({group_of(scene) or 'other'})", f"{count:,}", where.get(at, "camera path"), *cells])
+        lines.append(
+            [
+                f"{scene} ({group_of(scene) or 'other'})",
+                f"{count:,}",
+                where.get(at, "camera path"),
+                *cells,
+            ]
+        )
     variants, still = variant_table(table_of(rows), settings)
     now = json.loads(json.dumps(settings_of(0, 0)))
     moved = [n for n, value in now.items() if "." in n and settings.get(n, value) != value]
     return PAGE.format(
-        **{name: settings[name] for name in ("views", "width")}, little=LITTLE, variants=variants,
+        **{name: settings[name] for name in ("views", "width")},
+        little=LITTLE,
+        variants=variants,
         scenes=markdown(["scene (list)", "Gaussians", "views", *map(percent, keeps)], lines),
         still=", ".join(f"`{name}`" for name in still) or "none",
-        moved=f"\n\nDefaults that have changed since: {', '.join(f'`{name}`' for name in moved)}." if moved else "",
-    )  # fmt: skip
+        moved=f"\n\nDefaults that have changed since: {', '.join(f'`{name}`' for name in moved)}."
+        if moved
+        else "",
+    )
 
 
 def _value(value: Any) -> str:
@@ -230,13 +278,15 @@ def write(files: tuple[Path, ...], folder: Path) -> None:
     """Write ablation.json and ablation.md from files of this program.
 
     Raises:
-        SystemExit: if a file cannot be read, two files have different settings or one row twice, or there is nothing to
-            compare.
+        SystemExit: if a file cannot be read, two files have different settings or one row twice, or
+            there is nothing to compare.
     """
     rows, settings = read(files, "ablation.py")
     rows = current(rows)
     if table_of(rows).empty:
-        raise SystemExit(f"{', '.join(map(str, files))}: no variant and the defaults of one scene; expected some")
+        raise SystemExit(
+            f"{', '.join(map(str, files))}: no variant and the defaults of one scene; expected some"
+        )
     write_rows(rows, settings, folder / "ablation.json")
     with replacing(folder / "ablation.md") as part:
         part.write_text(page(rows, settings), "utf-8")
@@ -255,10 +305,12 @@ def main(
     write_from: Annotated[tuple[Path, ...], tyro.conf.arg(name="write")] = (),
     record: Path = FOLDER,
 ) -> None:
-    """Print what each setting of merging is worth: the change in dB where a variant takes the place of the defaults.
+    """Print what each setting of merging is worth: the change in dB where a variant takes the place
+    of the defaults.
 
     Args:
-        scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in their held-out photos.
+        scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in
+            their held-out photos.
         keep: shares of the Gaussians to keep.
         variants: names of variants to measure.
         views: at most so many views of each scene, evenly spread.
@@ -273,7 +325,9 @@ def main(
         return
     check_options(scenes, keep, views, (width,))
     if unknown := {*variants} - {*VARIANTS}:
-        raise SystemExit(f"--variants {', '.join(sorted(unknown))}; expected some of: {', '.join(VARIANTS)}")
+        raise SystemExit(
+            f"--variants {', '.join(sorted(unknown))}; expected some of: {', '.join(VARIANTS)}"
+        )
     settings = settings_of(views, width)
     results = Results(json_path, settings, resume)
     shown: list[Row] = []
@@ -282,7 +336,12 @@ def main(
         rows = {key(row): row for row in known_rows(results, scene)}
         there = {key(row) for row in current(list(rows.values()))}
         ats = (PHOTOS, POSES) if scene.looks[0].at == PHOTOS else (scene.looks[0].at,)
-        wanted = [(at, share, variant) for at in ats for share in keep for variant in (BASELINE, *variants)]
+        wanted = [
+            (at, share, variant)
+            for at in ats
+            for share in keep
+            for variant in (BASELINE, *variants)
+        ]
         if tasks := [task for task in wanted if task not in there]:
             measure(scene, path, tasks, results, rows)
         shown += [row for row in results.of(name) if row["keep"] in keep]

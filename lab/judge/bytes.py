@@ -1,11 +1,13 @@
 """What scenes are worth for their bytes: PSNR of files of equal sizes, ours and splat-transform's.
 
-    python -m lab.judge.bytes scenes/rock.ply scenes/bouquet.ply --splat-transform node_modules/.bin/splat-transform \\
+    python -m lab.judge.bytes scenes/rock.ply scenes/bouquet.ply --splat-transform
+    node_modules/.bin/splat-transform \\
         --json docs/record/bytes.json --picture docs/record/bytes.png --resume
 
-Ours are files of ``prune`` and ``compact`` with ``--keep SIZE``. splat-transform has no budgets in bytes: its PLY of
-the count at which its file meets the size, found by trying, is converted. All files are read by this package and
-compared along the camera path of the scene's name, as ``lab.judge.judge`` does.
+Ours are files of ``prune`` and ``compact`` with ``--keep SIZE``. splat-transform has no budgets in
+bytes: its PLY of the count at which its file meets the size, found by trying, is converted. All
+files are read by this package and compared along the camera path of the scene's name, as
+``lab.judge.judge`` does.
 """
 
 from __future__ import annotations
@@ -41,23 +43,37 @@ def files_of(
             if name == PEER:
                 seconds = peer_file(peer, source, len(scene.dense), int(size * 1e6), target)
             else:
-                seconds = run_measured(pointsplat_command(cast(Way, name), source, f"{size:g}MB", target)).cpu_seconds
+                seconds = run_measured(
+                    pointsplat_command(cast(Way, name), source, f"{size:g}MB", target)
+                ).cpu_seconds
             small = read_scene(target)
             about = {"scene": scene.name, "digest": scene.digest, "megabytes": size, "way": way}
-            yield about | {"bytes": target.stat().st_size, "count": len(small), "cpu_seconds": seconds, "small": small}
+            yield about | {
+                "bytes": target.stat().st_size,
+                "count": len(small),
+                "cpu_seconds": seconds,
+                "small": small,
+            }
 
 
-def peer_file(peer: SplatTransform, source: Path, gaussians: int, limit: int, target: Path) -> float:
-    """Write splat-transform's largest file of at most ``limit`` bytes, within 3 %; returns the CPU seconds of the last
-    try."""
-    low, high, each = 0, gaussians + 1, 20.0
-    best, seconds = 0, 0.0
+def peer_file(
+    peer: SplatTransform, source: Path, gaussians: int, limit: int, target: Path
+) -> float:
+    """Write splat-transform's largest file of at most ``limit`` bytes, within 3 %; returns the CPU
+    seconds of the last try."""
+    low = 0
+    high = gaussians + 1
+    each = 20.0
+    best = 0
+    seconds = 0.0
     for _ in range(5):
         count = min(max(round(0.985 * limit / each), low + 1), high - 1, gaussians)
         decimated = target.with_suffix(".ply")
         seconds = run_measured(peer.modes[0].command(source, count, decimated)).cpu_seconds
         tried = target.with_name(f"tried{target.suffix}")
-        seconds += run_measured([*peer.command, "-w", "-g", "cpu", str(decimated), str(tried)]).cpu_seconds
+        seconds += run_measured(
+            [*peer.command, "-w", "-g", "cpu", str(decimated), str(tried)]
+        ).cpu_seconds
         size = tried.stat().st_size
         each = size / count
         if size <= limit:
@@ -75,19 +91,29 @@ def peer_file(peer: SplatTransform, source: Path, gaussians: int, limit: int, ta
 
 
 def leads(rows: list[Row]) -> pd.DataFrame:
-    """dB that each of our ways is above the best file of splat-transform: rows by size and scene, a column a way."""
+    """dB that each of our ways is above the best file of splat-transform: rows by size and scene, a
+    column a way."""
     table = pd.DataFrame(rows)
     table["name"] = table["way"].str.rsplit(" ", n=1).str[0]
-    best = table.pivot_table(index=["megabytes", "scene"], columns="name", values="covered_psnr", aggfunc="max")
+    best = table.pivot_table(
+        index=["megabytes", "scene"], columns="name", values="covered_psnr", aggfunc="max"
+    )
     return best.reindex(columns=OURS).sub(best.get(PEER), axis=0).dropna(axis="columns", how="all")
 
 
 def lead_table(rows: list[Row]) -> None:
-    """Print the mean and the smallest lead for each size, where there are files of splat-transform."""
+    """Print the mean and the smallest lead for each size, where there are files of
+    splat-transform."""
     if not any(row["way"].startswith(PEER) for row in rows):
         return
     lines = [
-        (f"{size:g} MB", way, len(known), f"{known.mean():+.1f}", f"{known.min():+.1f} {known.idxmin()[1]}")
+        (
+            f"{size:g} MB",
+            way,
+            len(known),
+            f"{known.mean():+.1f}",
+            f"{known.min():+.1f} {known.idxmin()[1]}",
+        )
         for size, same in leads(rows).groupby("megabytes")
         for way in same
         if len(known := same[way].dropna())
@@ -101,7 +127,8 @@ def draw(rows: list[Row], path: Path) -> None:
     from matplotlib.figure import Figure
 
     scenes = list(grouped(rows, lambda row: row["scene"]).items())
-    columns, sizes = min(4, len(scenes)), sorted({row["megabytes"] for row in rows})
+    columns = min(4, len(scenes))
+    sizes = sorted({row["megabytes"] for row in rows})
     lines = -(-len(scenes) // columns)
     figure = Figure(figsize=(3.6 * columns, 2.9 * lines), layout="constrained")
     colours = {"prune": "tab:blue", "compact": "tab:green", PEER: "tab:red"}
@@ -111,10 +138,20 @@ def draw(rows: list[Row], path: Path) -> None:
             points = sorted(points, key=lambda row: row["bytes"])
             name, _, suffix = way.rpartition(" ")
             axes.plot(
-                [row["bytes"] / 1e6 for row in points], [row["covered_psnr"] for row in points], label=way,
-                color=colours[name], linestyle="-" if suffix == ".sog" else "--", marker=".",
-            )  # fmt: skip
-        axes.set(title=scene, xscale="log", xlim=(0.8 * sizes[0], 1.25 * sizes[-1]), xlabel="MB", ylabel="dB")
+                [row["bytes"] / 1e6 for row in points],
+                [row["covered_psnr"] for row in points],
+                label=way,
+                color=colours[name],
+                linestyle="-" if suffix == ".sog" else "--",
+                marker=".",
+            )
+        axes.set(
+            title=scene,
+            xscale="log",
+            xlim=(0.8 * sizes[0], 1.25 * sizes[-1]),
+            xlabel="MB",
+            ylabel="dB",
+        )
         axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
         axes.minorticks_off()
         axes.grid(alpha=0.3)
@@ -126,7 +163,13 @@ def draw(rows: list[Row], path: Path) -> None:
 def main(
     scenes: tyro.conf.Positional[tuple[Path, ...]] = (),
     megabytes: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0),
-    ways: tuple[str, ...] = ("prune .sog", "compact .sog", "prune .spz", f"{PEER} .sog", f"{PEER} .spz"),
+    ways: tuple[str, ...] = (
+        "prune .sog",
+        "compact .sog",
+        "prune .spz",
+        f"{PEER} .sog",
+        f"{PEER} .spz",
+    ),
     splat_transform: str | None = None,
     width: int = 960,
     views: int = 8,
@@ -138,7 +181,8 @@ def main(
 
     Args:
         scenes: PLY files that have a camera path of their name.
-        megabytes: sizes of files. A scene whose PLY is smaller than four times a size is left out there.
+        megabytes: sizes of files. A scene whose PLY is smaller than four times a size is left out
+            there.
         ways: what is measured, each a command and a format.
         splat_transform: the program; by default the one on PATH.
         width: of the pictures, pixels.
@@ -157,7 +201,9 @@ def main(
         there = {(row["megabytes"], row["way"]) for row in known}
         for size in (size for size in megabytes if 4e6 * size <= path.stat().st_size):
             left = tuple(way for way in ways if (size, way) not in there)
-            made = list(tracked(files_of(scene, path, size, left, peer), f"{name}: {size:g} MB", len(left)))
+            made = list(
+                tracked(files_of(scene, path, size, left, peer), f"{name}: {size:g} MB", len(left))
+            )
             smalls: list[Gaussians] = [row.pop("small") for row in made]
             for number, look, measures in losses(scene, smalls, None):
                 known.append(made[number] | {"at": look.at, "views": len(look.views)} | measures)
@@ -165,10 +211,17 @@ def main(
     rows = results.rows
     heads = ("scene", "MB", "way", "bytes", "Gaussians", "dB", "CPU s")
     lines = (
-        (r["scene"], r["megabytes"], r["way"], f"{r['bytes']:,}", f"{r['count']:,}", f"{r['covered_psnr']:.2f}",
-         f"{r['cpu_seconds']:.0f}")
+        (
+            r["scene"],
+            r["megabytes"],
+            r["way"],
+            f"{r['bytes']:,}",
+            f"{r['count']:,}",
+            f"{r['covered_psnr']:.2f}",
+            f"{r['cpu_seconds']:.0f}",
+        )
         for r in sorted(rows, key=lambda row: (row["scene"], row["megabytes"], row["way"]))
-    )  # fmt: skip
+    )
     console().print(table(f"PSNR at {width} pixels", heads, lines, ("way",)))
     lead_table(rows)
     if picture is not None:

@@ -1,7 +1,7 @@
 """Camera paths written by hand: what a visitor of a scene would look at.
 
-A path is a JSON file of the scene's name in ``lab/judge/paths``. Neither the package's sampler of views nor its
-estimate of up had a part in them, so that they can judge what these lead to.
+A path is a JSON file of the scene's name in ``lab/judge/paths``. Neither the package's sampler of
+views nor its estimate of up had a part in them, so that they can judge what these lead to.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ ASPECT = (16, 9)
 """Shape of every picture: that of screens."""
 
 NEAR_PLANE = 1e-3
-"""Depth that views start at, as a share of the median distance between the eye and what it looks at."""
+"""Depth that views start at, as a share of the median distance between the eye and what it looks
+at."""
 
 FIELDS_OF_VIEW = (20.0, 120.0)
 """Degrees across the width that a path may ask for; beyond these it is more likely a mistake."""
@@ -56,12 +57,14 @@ def read_path(path: Path) -> CameraPath:
     try:
         content = json.loads(path.read_text("utf-8"))
         eyes, ats = (_vectors([view[end] for view in content["views"]]) for end in ("eye", "at"))
-        found = CameraPath(content["scene"], content["about"], _vectors([content["up"]])[0], 0.0, eyes, ats)
+        found = CameraPath(
+            content["scene"], content["about"], _vectors([content["up"]])[0], 0.0, eyes, ats
+        )
         found = replace(found, field_of_view=float(content["field_of_view"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SystemExit(
-            f"{path}: not a camera path of {path.stem} ({error!r}); expected scene, about, up, field_of_view, and "
-            "views of eye and at"
+            f"{path}: not a camera path of {path.stem} ({error!r}); expected scene, about, up, "
+            "field_of_view, and views of eye and at"
         ) from error
     low, high = FIELDS_OF_VIEW
     wrong = {
@@ -81,7 +84,9 @@ def _vectors(values: list[list[float]]) -> Tensor:
     """Finite vectors, (C, 3) float64. Raises ValueError or TypeError if they are none."""
     found = torch.tensor(values, dtype=torch.float64)
     if found.ndim != 2 or found.shape[1] != 3 or not len(found) or not bool(found.isfinite().all()):
-        raise ValueError(f"vectors of shape {tuple(found.shape)}; expected three finite numbers each")
+        raise ValueError(
+            f"vectors of shape {tuple(found.shape)}; expected three finite numbers each"
+        )
     return found
 
 
@@ -101,6 +106,10 @@ def views_of(path: Path, width: int) -> Views:
         raise SystemExit(f"pictures of a width of {width} asked for; expected at least 2 pixels")
     viewmats = look_at(found.eyes, found.ats, found.up)
     focal = 0.5 * width / math.tan(math.radians(found.field_of_view) / 2)
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    K = torch.tensor(
+        [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )
     near = NEAR_PLANE * float((found.ats - found.eyes).norm(dim=1).median())
-    return Views(viewmats, K.repeat(len(viewmats), 1, 1), width, height, torch.zeros(3), near_plane=near)
+    return Views(
+        viewmats, K.repeat(len(viewmats), 1, 1), width, height, torch.zeros(3), near_plane=near
+    )

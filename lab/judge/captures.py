@@ -1,16 +1,20 @@
-"""Captures with poses, public on GitHub, that views without poses are measured on; and how each is made ready to train.
+"""Captures with poses, public on GitHub, that views without poses are measured on; and how each is
+made ready to train.
 
-    python -m lab.judge.captures                                  # the list, with the commands of each capture
+    python -m lab.judge.captures                                  # the list, with the commands of
+    each capture
 
     git clone https://github.com/mamechun/gs_data clone && git -C clone checkout 57e50c56a1
-    python -m lab.judge.captures meeting clone captures/meeting   # photos, transforms.json, seed points
-    ns-train splatfacto-cpu --experiment-name meeting --max-num-iterations 2000 --data captures/meeting \\
+    python -m lab.judge.captures meeting clone captures/meeting   # photos, transforms.json, seed
+    points ns-train splatfacto-cpu --experiment-name meeting --max-num-iterations 2000 --data
+    captures/meeting \\
         nerfstudio-data --eval-mode interval --eval-interval 8
     python -m lab.judge.without_poses outputs/meeting/splatfacto-cpu/RUN
 
-Photos become pinhole pictures of one size, without distortion. Every eighth is held out. Whether a capture is for
-tuning or judges stands in ``lab/common/scenes.py``, and was decided before the first measurement. The captures are no
-part of this project, and most state no licence: fetch them from there.
+Photos become pinhole pictures of one size, without distortion. Every eighth is held out. Whether a
+capture is for tuning or judges stands in ``lab/common/scenes.py``, and was decided before the first
+measurement. The captures are no part of this project, and most state no licence: fetch them from
+there.
 """
 
 from __future__ import annotations
@@ -34,9 +38,12 @@ from pointsplat_ns.io.files import write_json
 
 Array = NDArray[np.float64]
 
-RATIO, NEAR, REACH, DEGREES = 0.75, 1.5, 3, 1.5
-"""Seed points: largest ratio of the two best matches' distances, largest distance from the epipolar line in pixels,
-photos that each is matched with, and least angle between two rays."""
+RATIO = 0.75
+NEAR = 1.5
+REACH = 3
+DEGREES = 1.5
+"""Seed points: largest ratio of the two best matches' distances, largest distance from the epipolar
+line in pixels, photos that each is matched with, and least angle between two rays."""
 
 KEYPOINTS = 2000
 """Largest number of keypoints of a photo."""
@@ -66,18 +73,44 @@ class Capture:
 
 CAPTURES = {
     "office": Capture(
-        *("antoniocarevic/diplomski123", "e334a3c8dcbb2dd9c3050eff0b508d620d3f29ba", "images", "transforms.json"),
-        *(50, (1080, 1920), "room", "an office of two desks, seen from its middle all round, sharp"),
+        *(
+            "antoniocarevic/diplomski123",
+            "e334a3c8dcbb2dd9c3050eff0b508d620d3f29ba",
+            "images",
+            "transforms.json",
+        ),
+        *(
+            50,
+            (1080, 1920),
+            "room",
+            "an office of two desks, seen from its middle all round, sharp",
+        ),
         opencv=True,
-        first=50,  # of 68: the poses of the others jump, and end 30 times as far away as the room is large
+        # of 68: the poses of the others jump, and end 30 times as far away as the room is large
+        first=50,
     ),
     "room35": Capture(
-        *("sabinleee/REAL", "c889c437571acef58a5348f13176746fc369bffb", "data/room/images", "data/room/sparse/0"),
+        *(
+            "sabinleee/REAL",
+            "c889c437571acef58a5348f13176746fc369bffb",
+            "data/room/images",
+            "data/room/sparse/0",
+        ),
         *(35, (1920, 1080), "room", "a studio flat with table, lamp, curtains; wide lens", "MIT"),
     ),
     "meeting": Capture(
-        *("mamechun/gs_data", "57e50c56a1e601e468e012e0814187e5f698825b", "dense/0/images", "dense/0/sparse"),
-        *(128, (750, 1000), "room", "a meeting room with lockers, table, ceiling and bare walls, seen all round"),
+        *(
+            "mamechun/gs_data",
+            "57e50c56a1e601e468e012e0814187e5f698825b",
+            "dense/0/images",
+            "dense/0/sparse",
+        ),
+        *(
+            128,
+            (750, 1000),
+            "room",
+            "a meeting room with lockers, table, ceiling and bare walls, seen all round",
+        ),
     ),
     "drone_hall": Capture(
         *("Nathan-Houel/SLAM-Drone", "6bd54a44b78226bd47608ceff2209c0fa2ebe01c"),
@@ -86,8 +119,16 @@ CAPTURES = {
     ),
     "chair": Capture(
         *("benedictquartey/cs1430proj", "3a136d97fd2677d04bdfcecf1c23ce2e30d90cb5"),
-        *("data/nerf_llff_data/dancingQ/images", "data/nerf_llff_data/dancingQ/sparse/0", 68, (1080, 1920)),
-        *("object in a room", "a chair with a robot's head in a laboratory, walked round; the room is seen behind"),
+        *(
+            "data/nerf_llff_data/dancingQ/images",
+            "data/nerf_llff_data/dancingQ/sparse/0",
+            68,
+            (1080, 1920),
+        ),
+        *(
+            "object in a room",
+            "a chair with a robot's head in a laboratory, walked round; the room is seen behind",
+        ),
     ),
     "figure": Capture(
         *("Caesar-xxx/NERF", "03460c01390b65d4e8e0e9a6385ca50900f502f2"),
@@ -97,16 +138,27 @@ CAPTURES = {
     "plant": Capture(
         *("lvllvl/NeRF", "3b6aec04f821cc5686fc40174aebfed7d182fcb9"),
         *("data/raw", "data/colmap_output/transforms.json", 171, (3213, 5712)),
-        *("object in a room", "a potted plant on a table of a living room, from all sides and heights"),
+        *(
+            "object in a room",
+            "a potted plant on a table of a living room, from all sides and heights",
+        ),
         opencv=True,
     ),
     "phone": Capture(
         *("eunseon02/mono_slam", "1f77fbb763857b96ac9a596bc18d1e962ce18dbf"),
         *("data/images", "data/transforms.json", 79, (2448, 2048)),
-        *("object in a room", "a phone on a desk before a keyboard, from near; the room is seen behind"),
+        *(
+            "object in a room",
+            "a phone on a desk before a keyboard, from near; the room is seen behind",
+        ),
     ),
     "can": Capture(
-        *("YhuoyuH/NeRF-Database", "83b34224ffb43e34e48db8137b3f95f8e7059cc3", "images", "sparse/0"),
+        *(
+            "YhuoyuH/NeRF-Database",
+            "83b34224ffb43e34e48db8137b3f95f8e7059cc3",
+            "images",
+            "sparse/0",
+        ),
         *(71, (720, 1280), "outdoors", "a can on the tiles of a terrace, railings behind"),
     ),
     "ray": Capture(
@@ -119,8 +171,9 @@ CAPTURES = {
         *(95, (960, 540), "object", "a plush ray on a white table, from near"),
     ),
 }
-"""Captures by name. Photos were looked at. Poses agree with matches between neighbouring photos: in nearly all pairs
-the median distance from the epipolar line is below one pixel of a picture of 800."""
+"""Captures by name. Photos were looked at. Poses agree with matches between neighbouring photos: in
+nearly all pairs the median distance from the epipolar line is below one pixel of a picture of
+800."""
 
 
 def prepare(capture: Capture, clone: Path, target: Path, side: int) -> int:
@@ -140,13 +193,19 @@ def prepare(capture: Capture, clone: Path, target: Path, side: int) -> int:
     Raises:
         SceneError: if photos or poses are not there.
     """
-    photos, poses = clone / capture.photos, clone / capture.poses
+    photos = clone / capture.photos
+    poses = clone / capture.poses
     if not photos.is_dir() or not poses.exists():
-        raise SceneError(f"{clone}: no {capture.photos} and {capture.poses}; expected github.com/{capture.repository}")
+        raise SceneError(
+            f"{clone}: no {capture.photos} and {capture.poses}; expected "
+            f"github.com/{capture.repository}"
+        )
     (target / "images").mkdir(parents=True, exist_ok=True)
     content = _of_colmap(poses, target) if poses.is_dir() else _of_json(poses, capture.opencv)
     frames = sorted(content["frames"], key=lambda frame: str(frame["file_path"]))[: capture.first]
-    size, pictures, written = None, [], []
+    size = None
+    pictures = []
+    written = []
     for frame in frames:
         path = photos / re.split(r"[\\/]", frame["file_path"])[-1]
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -159,9 +218,18 @@ def prepare(capture: Capture, clone: Path, target: Path, side: int) -> int:
         picture, K = _pinhole(picture, content | frame, size)
         cv2.imwrite(str(target / "images" / f"{path.stem}.png"), picture)
         pictures.append(picture)
-        numbers = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": size[0], "h": size[1]}
+        numbers = {
+            "fl_x": K[0, 0],
+            "fl_y": K[1, 1],
+            "cx": K[0, 2],
+            "cy": K[1, 2],
+            "w": size[0],
+            "h": size[1],
+        }
         matrix = frame["transform_matrix"]
-        written.append({"file_path": f"images/{path.stem}.png", "transform_matrix": matrix} | numbers)
+        written.append(
+            {"file_path": f"images/{path.stem}.png", "transform_matrix": matrix} | numbers
+        )
     if not poses.is_dir():
         _write_points(target / "sparse_pc.ply", *seed_points(pictures, written))
     result = {"camera_model": "PINHOLE", "ply_file_path": "sparse_pc.ply", "frames": written}
@@ -172,7 +240,8 @@ def prepare(capture: Capture, clone: Path, target: Path, side: int) -> int:
 
 
 def _of_colmap(model: Path, target: Path) -> dict[str, Any]:
-    """The content of ``transforms.json`` for a COLMAP model, whose points are written to the target."""
+    """The content of ``transforms.json`` for a COLMAP model, whose points are written to the
+    target."""
     from nerfstudio.process_data.colmap_utils import colmap_to_json
 
     colmap_to_json(model, target)
@@ -190,12 +259,20 @@ def _of_json(path: Path, opencv: bool) -> dict[str, Any]:
     return content
 
 
-def _pinhole(picture: NDArray[Any], camera: dict[str, Any], size: tuple[int, int]) -> tuple[NDArray[Any], Array]:
+def _pinhole(
+    picture: NDArray[Any], camera: dict[str, Any], size: tuple[int, int]
+) -> tuple[NDArray[Any], Array]:
     """A photo without distortion, of a size, and its intrinsics (3, 3) in pixels."""
     height, width = picture.shape[:2]
-    w, h = float(camera.get("w", width)), float(camera.get("h", height))
+    w = float(camera.get("w", width))
+    h = float(camera.get("h", height))
     focal = camera.get("fl_x") or 0.5 * w / np.tan(0.5 * camera["camera_angle_x"])
-    K = np.array([[focal, 0, camera.get("cx", w / 2)], [0, camera.get("fl_y", focal), camera.get("cy", h / 2)]])
+    K = np.array(
+        [
+            [focal, 0, camera.get("cx", w / 2)],
+            [0, camera.get("fl_y", focal), camera.get("cy", h / 2)],
+        ]
+    )
     K = np.vstack([K * np.array([[size[0] / w], [size[1] / h]]), [0, 0, 1]])
     picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     bent = np.array([camera.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
@@ -205,7 +282,9 @@ def _pinhole(picture: NDArray[Any], camera: dict[str, Any], size: tuple[int, int
     return cv2.undistort(picture, K, bent, None, straight), straight
 
 
-def seed_points(pictures: list[NDArray[Any]], frames: list[dict[str, Any]]) -> tuple[Array, NDArray[Any]]:
+def seed_points(
+    pictures: list[NDArray[Any]], frames: list[dict[str, Any]]
+) -> tuple[Array, NDArray[Any]]:
     """Points triangulated from matches between each photo and the next ones.
 
     Args:
@@ -215,10 +294,15 @@ def seed_points(pictures: list[NDArray[Any]], frames: list[dict[str, Any]]) -> t
     Returns:
         Points (P, 3) in the frame of the poses, and colours (P, 3) uint8 in RGB order.
     """
-    finder, matcher = cv2.SIFT_create(KEYPOINTS), cv2.BFMatcher()
-    found = [finder.detectAndCompute(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), None) for picture in pictures]
+    finder = cv2.SIFT_create(KEYPOINTS)
+    matcher = cv2.BFMatcher()
+    found = [
+        finder.detectAndCompute(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), None)
+        for picture in pictures
+    ]
     cameras = [_camera(frame) for frame in frames]
-    points, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    points = [np.zeros((0, 3))]
+    colours = [np.zeros((0, 3), np.uint8)]
     for i, first in enumerate(found):
         for j in range(i + 1, min(i + 1 + REACH, len(found))):
             second = found[j]
@@ -228,7 +312,10 @@ def seed_points(pictures: list[NDArray[Any]], frames: list[dict[str, Any]]) -> t
             best = [a for a, b in pairs if a.distance < RATIO * b.distance]
             if not best:
                 continue
-            at = np.array([first[0][m.queryIdx].pt for m in best]), np.array([second[0][m.trainIdx].pt for m in best])
+            at = (
+                np.array([first[0][m.queryIdx].pt for m in best]),
+                np.array([second[0][m.trainIdx].pt for m in best]),
+            )
             world, good = _triangulated(at, (cameras[i], cameras[j]))
             points.append(world[good])
             pixels = np.floor(at[0][good]).astype(int)
@@ -248,8 +335,8 @@ def _camera(frame: dict[str, Any]) -> tuple[Array, Array]:
 def _triangulated(
     at: tuple[Array, Array], cameras: tuple[tuple[Array, Array], tuple[Array, Array]]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Points (M, 3) of matched pixels (M, 2), and whether each lies near both pixels, before both cameras, under an
-    angle that tells its depth."""
+    """Points (M, 3) of matched pixels (M, 2), and whether each lies near both pixels, before both
+    cameras, under an angle that tells its depth."""
     four = cv2.triangulatePoints(*(K @ view for K, view in cameras), *(pixels.T for pixels in at))
     with np.errstate(divide="ignore", invalid="ignore"):
         world = (four[:3] / four[3]).T.astype(np.float64)
@@ -267,7 +354,10 @@ def _triangulated(
 
 
 def _write_points(path: Path, points: Array, colours: NDArray[Any]) -> None:
-    kinds = [*((axis, "f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+    kinds = [
+        *((axis, "f4") for axis in "xyz"),
+        *((name, "u1") for name in ("red", "green", "blue")),
+    ]
     rows = np.zeros(len(points), kinds)
     for name, column in zip(rows.dtype.names, (*points.T, *colours.T), strict=True):
         rows[name] = column
@@ -290,11 +380,22 @@ def main(
     """
     if not name:
         rows = [
-            (name, group_of(name), a.kind, a.count, f"{a.size[0]} x {a.size[1]}", a.licence, a.shows, a.repository)
+            (
+                name,
+                group_of(name),
+                a.kind,
+                a.count,
+                f"{a.size[0]} x {a.size[1]}",
+                a.licence,
+                a.shows,
+                a.repository,
+            )
             for name, a in CAPTURES.items()
         ]
         heads = ("capture", "for", "kind", "photos", "pixels", "licence", "shows", "github.com/")
-        console().print(table("captures", heads, rows, left=("for", "kind", "licence", "shows", "github.com/")))
+        console().print(
+            table("captures", heads, rows, left=("for", "kind", "licence", "shows", "github.com/"))
+        )
         return
     if name not in CAPTURES or clone is None or target is None:
         raise SceneError(

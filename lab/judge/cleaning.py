@@ -3,9 +3,10 @@
     python -m lab.judge.cleaning outputs/meeting/splatfacto-cpu/RUN outputs/ray/splatfacto-cpu/RUN
     python -m lab.judge.cleaning RUN --strengths 1 --sampled
 
-Held-out photos among the training photos say what a scene loses. Photos outside of these say what it gains: train on
-the others, with ``train_filenames`` and ``test_filenames`` in ``transforms.json``; held out was the fifth of the photos
-that lies farthest along the first principal axis of the cameras' positions.
+Held-out photos among the training photos say what a scene loses. Photos outside of these say what
+it gains: train on the others, with ``train_filenames`` and ``test_filenames`` in
+``transforms.json``; held out was the fifth of the photos that lies farthest along the first
+principal axis of the cameras' positions.
 """
 
 from __future__ import annotations
@@ -63,11 +64,22 @@ def main(
         rows = []
         for strength in strengths:
             after = measured(dense[scores >= strength])
-            psnr, ssim = ([b - a for a, b in zip(before[key], after[key], strict=True)] for key in before)
+            psnr, ssim = (
+                [b - a for a, b in zip(before[key], after[key], strict=True)] for key in before
+            )
             changes = map(number(3, sign="+"), (mean(psnr), min(psnr), max(psnr), mean(ssim)))
-            rows.append([f"{strength:g}", number(2)(100 * float((scores < strength).double().mean())), *changes])
+            rows.append(
+                [
+                    f"{strength:g}",
+                    number(2)(100 * float((scores < strength).double().mean())),
+                    *changes,
+                ]
+            )
         heads = ("strength", "removed, %", "PSNR, dB", "worst photo", "best photo", "SSIM")
-        title = f"{name} ({group_of(name)}): {mean(before['psnr']):.2f} dB in {len(held_out.views)} held-out photos"
+        title = (
+            f"{name} ({group_of(name)}): {mean(before['psnr']):.2f} dB in {len(held_out.views)} "
+            "held-out photos"
+        )
         console().print(table(title, heads, rows))
 
 

@@ -1,13 +1,17 @@
-"""A judge that is not the defendant: what scenes lose when they are made smaller, in views that were chosen by hand.
+"""A judge that is not the defendant: what scenes lose when they are made smaller, in views that
+were chosen by hand.
 
-    python -m lab.judge.judge --list                            # which scenes are for tuning, which judge
-    python -m lab.judge.judge --sheet sheets scenes/rock.ply    # what the views of a scene's path show
-    python -m lab.judge.judge scenes/rock.ply RUN --splat-transform v3/node_modules/.bin/splat-transform \\
-        --json judge.json --resume --again prune compact         # these two anew, all other rows as they are
+    python -m lab.judge.judge --list                            # which scenes are for tuning, which
+    judge python -m lab.judge.judge --sheet sheets scenes/rock.ply    # what the views of a scene's
+    path show python -m lab.judge.judge scenes/rock.ply RUN --splat-transform
+    v3/node_modules/.bin/splat-transform \\
+        --json judge.json --resume --again prune compact         # these two anew, all other rows as
+        they are
 
-A PLY is looked at along the camera path of its name in ``lab/judge/paths``, at several widths; a Splatfacto run from
-the poses of its held-out photos. Every way runs as a process of its own that reads the same PLY and writes one; its
-time and peak memory are those of that process. Smaller scenes are not kept.
+A PLY is looked at along the camera path of its name in ``lab/judge/paths``, at several widths; a
+Splatfacto run from the poses of its held-out photos. Every way runs as a process of its own that
+reads the same PLY and writes one; its time and peak memory are those of that process. Smaller
+scenes are not kept.
 """
 
 from __future__ import annotations
@@ -65,7 +69,11 @@ HEADS = {
 
 
 def tasks_of(
-    scene: JudgedScene, known: list[Row], keeps: tuple[float, ...], ways: list[Reducer], again: tuple[str, ...]
+    scene: JudgedScene,
+    known: list[Row],
+    keeps: tuple[float, ...],
+    ways: list[Reducer],
+    again: tuple[str, ...],
 ) -> list[Task]:
     """What is to be measured: ways to do again, and what does not have a row for each look."""
     there = {(row["keep"], row["method"], row["at"]) for row in known if not row["failed"]}
@@ -73,19 +81,23 @@ def tasks_of(
         (keep, way)
         for keep in keeps
         for way in ways
-        if way.label in again or any((keep, way.label, look.at) not in there for look in scene.looks)
+        if way.label in again
+        or any((keep, way.label, look.at) not in there for look in scene.looks)
     ]
 
 
-def rows_that_stay(scene: JudgedScene, known: list[Row], tasks: list[Task], again: tuple[str, ...]) -> list[Row]:
-    """The known rows that new ones do not replace. What is done again replaces rows of all widths, since they may be of
-    an older program."""
+def rows_that_stay(
+    scene: JudgedScene, known: list[Row], tasks: list[Task], again: tuple[str, ...]
+) -> list[Row]:
+    """The known rows that new ones do not replace. What is done again replaces rows of all widths,
+    since they may be of an older program."""
     done = {(keep, way.label) for keep, way in tasks}
     at = {look.at for look in scene.looks}
     return [
         row
         for row in known
-        if (row["keep"], row["method"]) not in done or not (row["failed"] or row["method"] in again or row["at"] in at)
+        if (row["keep"], row["method"]) not in done
+        or not (row["failed"] or row["method"] in again or row["at"] in at)
     ]
 
 
@@ -96,12 +108,16 @@ def rows_of(scene: JudgedScene, path: Path, tasks: list[Task], lpips: Lpips | No
     rows = [about for about, small in reduced if small is None]
     done = [(about, small) for about, small in reduced if small is not None]
     found = losses(scene, [small for _, small in done], lpips)
-    for index, look, measures in tracked(found, f"{scene.name}: compared", len(done) * len(scene.looks)):
+    for index, look, measures in tracked(
+        found, f"{scene.name}: compared", len(done) * len(scene.looks)
+    ):
         rows.append(done[index][0] | {"at": look.at, "views": len(look.views)} | measures)
     return rows
 
 
-def _reduced(scene: JudgedScene, path: Path, tasks: list[Task]) -> Iterator[tuple[Row, Gaussians | None]]:
+def _reduced(
+    scene: JudgedScene, path: Path, tasks: list[Task]
+) -> Iterator[tuple[Row, Gaussians | None]]:
     """What each task makes of a scene, and what it took; None, and why, where it failed."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "dense.ply"
@@ -110,7 +126,12 @@ def _reduced(scene: JudgedScene, path: Path, tasks: list[Task]) -> Iterator[tupl
         else:
             write_ply(scene.dense, source)
         for keep, way in tasks:
-            about: Row = {"scene": scene.name, "digest": scene.digest, "keep": keep, "method": way.label}
+            about: Row = {
+                "scene": scene.name,
+                "digest": scene.digest,
+                "keep": keep,
+                "method": way.label,
+            }
             about |= {"gaussians": len(scene.dense), "failed": ""}
             try:
                 small, usage = way.reduce(source, count_of(keep, len(scene.dense)))
@@ -128,7 +149,11 @@ def ordered(rows: list[Row]) -> list[Row]:
 
     def key(row: Row) -> Any:
         method = row["method"]
-        return at_order(row["at"]), -row["keep"], (ours.index(method) if method in ours else len(ours), method)
+        return (
+            at_order(row["at"]),
+            -row["keep"],
+            (ours.index(method) if method in ours else len(ours), method),
+        )
 
     return sorted(rows, key=key)
 
@@ -137,20 +162,31 @@ def scene_table(rows: list[Row]) -> Table:
     """The rows of one scene; a dash for what cannot be had, no column for what none has."""
     columns = [name for name in HEADS if any(row.get(name) is not None for row in rows)]
     lines = [
-        [row["at"], percent(row["keep"]), row["method"], *(HEADS[name][1](row.get(name)) for name in columns)]
+        [
+            row["at"],
+            percent(row["keep"]),
+            row["method"],
+            *(HEADS[name][1](row.get(name)) for name in columns),
+        ]
         for row in rows
     ]
     title = f"{rows[0]['scene']}: against the dense scene's renders; MB: peak memory; photos last"
-    return table(title, ["at", "kept", "way", *(HEADS[column][0] for column in columns)], lines, left=["way"])
+    return table(
+        title, ["at", "kept", "way", *(HEADS[column][0] for column in columns)], lines, left=["way"]
+    )
 
 
 def scene_list() -> Table:
     """Which scenes are for tuning and which judge, and which have a camera path."""
     others = sorted({path.stem for path in path_of("").parent.glob("*.json")} - {*TUNING, *JUDGED})
     names = (*TUNING, *JUDGED, *others)
-    lines = [(n, group_of(n) or "other", path_of(n).name if path_of(n).is_file() else "-") for n in names]
+    lines = [
+        (n, group_of(n) or "other", path_of(n).name if path_of(n).is_file() else "-") for n in names
+    ]
     heads = ("scene", "for", "camera path")
-    return table("scenes; those with photos are judged in the poses of held-out photos", heads, lines, heads)
+    return table(
+        "scenes; those with photos are judged in the poses of held-out photos", heads, lines, heads
+    )
 
 
 def write_sheets(scenes: tuple[Path, ...], folder: Path) -> None:
@@ -180,15 +216,18 @@ def main(
     """Print tables of what scenes lose, in views that were chosen by hand.
 
     Args:
-        scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in their held-out photos.
+        scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in
+            their held-out photos.
         keep: shares of the Gaussians to keep.
-        ways: prune and compact as a user calls them; memory: prune in 2 GB; thorough: compact with that effort.
+        ways: prune and compact as a user calls them; memory: prune in 2 GB; thorough: compact with
+            that effort.
         splat_transform: programs, of any versions, each of whose modes is a way too.
         widths: of the pictures of camera paths, pixels; the height is 9/16 of it.
         views: at most so many views of each scene, evenly spread.
         lpips: whether to compute LPIPS, which is done up to 960 pixels wide.
         json_path: write all rows there, after each scene.
-        resume: take up the rows of that file, also of ways that are not asked for now. What it lacks is measured.
+        resume: take up the rows of that file, also of ways that are not asked for now. What it
+            lacks is measured.
         again: ways, as the tables call them, that are measured though the file has them.
         sheet: only draw what the views show: one picture a scene, into this folder.
         list_scenes: only print which scenes are for tuning, and which judge.
@@ -203,7 +242,9 @@ def main(
     programs = programs_of(ways, splat_transform)
     labels = [program.label for program in programs]
     if unknown := {*again} - {*labels}:
-        raise SystemExit(f"--again {', '.join(sorted(unknown))}; expected some of: {', '.join(labels)}")
+        raise SystemExit(
+            f"--again {', '.join(sorted(unknown))}; expected some of: {', '.join(labels)}"
+        )
     if again and not resume:
         raise SystemExit("--again without --resume; expected the file whose other rows stay")
     names = check(scenes)
@@ -214,7 +255,10 @@ def main(
         scene = load(path, widths, views)
         known = known_rows(results, scene)
         if tasks := tasks_of(scene, known, keep, programs, again):
-            print(f"{name}: {len(scene.dense):,} Gaussians, {len(scene.looks[0].views)} views", flush=True)
+            print(
+                f"{name}: {len(scene.dense):,} Gaussians, {len(scene.looks[0].views)} views",
+                flush=True,
+            )
             stay = rows_that_stay(scene, known, tasks, again)
             results.put(name, ordered(stay + rows_of(scene, path, tasks, network)))
         else:

@@ -1,11 +1,14 @@
-"""Large scenes: what `prune`, `compact` and splat-transform make of them, beside the publisher's own levels.
+"""Large scenes: what `prune`, `compact` and splat-transform make of them, beside the publisher's
+own levels.
 
-    python -m lab.judge.large HeadquarterGarden/lod-meta.json --name headquarter_garden --json docs/record/large.json \\
+    python -m lab.judge.large HeadquarterGarden/lod-meta.json --name headquarter_garden --json
+    docs/record/large.json \\
         --splat-transform node_modules/.bin/splat-transform --resume
     python -m lab.judge.large taebak.ply --counts 425000 --json docs/record/large.json --resume
     python -m lab.judge.large --write docs/record/large.json
 
-The last writes ``docs/record/large.md``. A streamed SOG is compared by its finest level, at the counts of its others.
+The last writes ``docs/record/large.md``. A streamed SOG is compared by its finest level, at the
+counts of its others.
 """
 
 from __future__ import annotations
@@ -45,14 +48,23 @@ PAGE = f"""# Large scenes
 """
 
 
-def rows_of(scene: Path, name: str, counts: tuple[int, ...], programs: list[Reducer], results: Results) -> None:
+def rows_of(
+    scene: Path, name: str, counts: tuple[int, ...], programs: list[Reducer], results: Results
+) -> None:
     """Measure what the results lack of a scene, and put each row there at once."""
     whole = read_scene(scene)
     known = {(row["count"], row["way"]) for row in results.of(name)}
     judges = {width: DenseViews(whole, views_of(path_of(name), width)) for width in WIDTHS}
 
     def put(count: int, way: str, small: Gaussians, cost: dict[str, float | None]) -> None:
-        row: Row = {"scene": name, "gaussians": len(whole), "count": count, "way": way, "kept": len(small), **cost}
+        row: Row = {
+            "scene": name,
+            "gaussians": len(whole),
+            "count": count,
+            "way": way,
+            "kept": len(small),
+            **cost,
+        }
         for width, judge in judges.items():
             psnrs = judge.psnrs(small)
             row |= {f"mean_{width}": fmean(psnrs), f"worst_{width}": min(psnrs)}
@@ -78,13 +90,21 @@ def rows_of(scene: Path, name: str, counts: tuple[int, ...], programs: list[Redu
 def page(rows: list[Row]) -> str:
     """The page of all scenes, the largest first."""
     parts = [PAGE]
-    for (name, gaussians), same in sorted(grouped(rows, _scene).items(), key=lambda item: -item[0][1]):
+    for (name, gaussians), same in sorted(
+        grouped(rows, _scene).items(), key=lambda item: -item[0][1]
+    ):
         lines = []
         for count, beside in sorted(grouped(same, lambda row: row["count"]).items(), reverse=True):
             first = next((row["cpu_seconds"] for row in beside if row["way"] == FIRST), None)
             for row in sorted(beside, key=_order):
-                quality = [f"{row[f'mean_{width}']:.1f}/{row[f'worst_{width}']:.1f}" for width in WIDTHS]
-                way = PEER if row["way"].startswith(PEER) else " ".join(WAYS.get(row["way"], (row["way"],)))
+                quality = [
+                    f"{row[f'mean_{width}']:.1f}/{row[f'worst_{width}']:.1f}" for width in WIDTHS
+                ]
+                way = (
+                    PEER
+                    if row["way"].startswith(PEER)
+                    else " ".join(WAYS.get(row["way"], (row["way"],)))
+                )
                 lines.append([f"{count:,}", way, *quality, *_cost(row, first)])
         heads = ("Gaussians", "way", *(f"{width} pixels" for width in WIDTHS), f"x {FIRST}", "GB")
         parts.append(f"## {name}, {gaussians:,} Gaussians\n\n{markdown(heads, lines)}\n")
@@ -136,7 +156,9 @@ def main(
     if scene is None or (not counts and scene.suffix == ".ply"):
         raise SystemExit("expected a streamed SOG, or a PLY and --counts")
     results = Results(json_path, {}, resume)
-    programs = programs_of(ways, () if splat_transform is None else (splat_transform,))[: len(ways) + 1]
+    programs = programs_of(ways, () if splat_transform is None else (splat_transform,))[
+        : len(ways) + 1
+    ]
     rows_of(scene, name or scene.stem, counts, programs, results)
     print(page(results.rows))
 

@@ -1,10 +1,13 @@
-"""The record of what lab/judge/judge.py measured: rows as JSON, tables as a page, and the table of the README.
+"""The record of what lab/judge/judge.py measured: rows as JSON, tables as a page, and the table of
+the README.
 
-    python -m lab.judge.record judge.json judge_photos.json                            # takes new rows
-    python -m lab.judge.record docs/record/judge.json docs/record/judge_photos.json    # writes the tables again
+    python -m lab.judge.record judge.json judge_photos.json                            # takes new
+    rows python -m lab.judge.record docs/record/judge.json docs/record/judge_photos.json    # writes
+    the tables again
 
-Rows of camera paths go to ``judge.json``, rows of held-out photos to ``judge_photos.json``. Both are files that
-``judge.py --resume`` takes up. A scene counts at a budget once prune, compact and a mode of splat-transform are there.
+Rows of camera paths go to ``judge.json``, rows of held-out photos to ``judge_photos.json``. Both
+are files that ``judge.py --resume`` takes up. A scene counts at a budget once prune, compact and a
+mode of splat-transform are there.
 """
 
 from __future__ import annotations
@@ -38,7 +41,8 @@ DIGITS = {"seconds": 1, "cpu_seconds": 1, "peak_bytes": -6} | {
 }
 """Digits after the point that rows keep: a tenth of what tables show, or finer."""
 
-START, END = "<!-- judge -->", "<!-- /judge -->"
+START = "<!-- judge -->"
+END = "<!-- /judge -->"
 """What stands around the table in the README."""
 
 PAGE = """# What smaller scenes lose
@@ -58,24 +62,36 @@ def read(paths: Iterable[Path], program: str = "judge.py") -> tuple[list[Row], d
     """All rows of some files of judge.py or another program, rounded, and their settings.
 
     Raises:
-        SystemExit: if a file cannot be read or is no such file, or two have different settings or one row twice.
+        SystemExit: if a file cannot be read or is no such file, or two have different settings or
+            one row twice.
     """
     rows: list[Row] = []
     settings: dict[str, Any] = {}
     for path in paths:
         try:
             content = json.loads(path.read_text("utf-8"))
-            new, its_own = content["rows"], content["settings"]
+            new = content["rows"]
+            its_own = content["settings"]
             keys = [_key(row) for row in new]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SystemExit(f"{path}: cannot be read ({error!r}); expected a file that {program} wrote") from error
+            raise SystemExit(
+                f"{path}: cannot be read ({error!r}); expected a file that {program} wrote"
+            ) from error
         if settings and its_own != settings:
-            other = [name for name in {**settings, **its_own} if settings.get(name) != its_own.get(name)]
-            found = ", ".join(f"{name} {its_own.get(name)}, the files before {settings.get(name)}" for name in other)
+            other = [
+                name for name in {**settings, **its_own} if settings.get(name) != its_own.get(name)
+            ]
+            found = ", ".join(
+                f"{name} {its_own.get(name)}, the files before {settings.get(name)}"
+                for name in other
+            )
             raise SystemExit(f"{path}: was written with {found}; expected the same")
         if twice := {*keys} & {_key(row) for row in rows}:
-            raise SystemExit(f"{path}: has rows that another file has, of {sorted({key[0] for key in twice})}")
-        settings, rows = its_own, rows + [rounded(row) for row in new]
+            raise SystemExit(
+                f"{path}: has rows that another file has, of {sorted({key[0] for key in twice})}"
+            )
+        settings = its_own
+        rows = rows + [rounded(row) for row in new]
     return rows, settings
 
 
@@ -88,7 +104,9 @@ def rounded(row: Row) -> Row:
     result = dict(row)
     for name, digits in DIGITS.items():
         if result.get(name) is not None:
-            result[name] = round(result[name], digits) if digits > 0 else int(round(result[name], digits))
+            result[name] = (
+                round(result[name], digits) if digits > 0 else int(round(result[name], digits))
+            )
     return result
 
 
@@ -100,13 +118,18 @@ def write_rows(rows: list[Row], settings: dict[str, Any], target: Path) -> None:
 
 
 def compared(rows: list[Row]) -> pd.DataFrame:
-    """Measures and costs by scene, width, budget and way, of the scenes, widths and budgets that have every one of
-    :data:`WAYS`. splat-transform has the best of its modes by each measure, and the costs of that of the best PSNR."""
+    """Measures and costs by scene, width, budget and way, of the scenes, widths and budgets that
+    have every one of :data:`WAYS`. splat-transform has the best of its modes by each measure, and
+    the costs of that of the best PSNR."""
     table = pd.DataFrame([row for row in rows if not row["failed"]])
     table["way"] = table["method"].where(~table["method"].str.startswith(PEER), PEER)
-    table = table[table["way"].isin(WAYS)].sort_values("covered_psnr", ascending=False, kind="stable")
+    table = table[table["way"].isin(WAYS)].sort_values(
+        "covered_psnr", ascending=False, kind="stable"
+    )
     place = ["scene", "at", "keep"]
-    groups = table[table.groupby(place)["way"].transform("nunique") == len(WAYS)].groupby([*place, "way"])
+    groups = table[table.groupby(place)["way"].transform("nunique") == len(WAYS)].groupby(
+        [*place, "way"]
+    )
     found = groups.first()
     for name in MEASURES:
         found[name] = groups[name].min() if name.endswith("lpips") else groups[name].max()
@@ -127,7 +150,14 @@ class Figures:
 
     def of(self, at: int | str, column: str) -> pd.DataFrame:
         """A figure at a width: rows by budget and scene, a column for each way."""
-        return self.table.xs(at, level="at")[column].astype(float).unstack("way").dropna().swaplevel().sort_index()
+        return (
+            self.table.xs(at, level="at")[column]
+            .astype(float)
+            .unstack("way")
+            .dropna()
+            .swaplevel()
+            .sort_index()
+        )
 
     def scenes(self, at: int | str) -> str:
         """How many scenes there are at a width: a number, or a span if budgets differ."""
@@ -135,7 +165,8 @@ class Figures:
         return f"{min(counts)} to {max(counts)}" if len(counts) > 1 else str(*counts)
 
     def lead(self, method: str, at: int | str, column: str) -> pd.Series:
-        """Lead in dB of ``prune`` over splat-transform or of ``compact`` over ``prune``, by budget and scene."""
+        """Lead in dB of ``prune`` over splat-transform or of ``compact`` over ``prune``, by budget
+        and scene."""
         values = self.of(at, column)
         return values[method] - values[PEER if method == "prune" else "prune"]
 
@@ -143,7 +174,10 @@ class Figures:
 def means(values: pd.DataFrame, digits: int) -> dict[str, dict[float, str]]:
     """The mean of a figure over scenes, by way and budget."""
     found = values.groupby("keep").mean()
-    return {_way(way): {keep: f"{value:.{digits}f}" for keep, value in found[way].items()} for way in WAYS}
+    return {
+        _way(way): {keep: f"{value:.{digits}f}" for keep, value in found[way].items()}
+        for way in WAYS
+    }
 
 
 def least(values: pd.Series) -> dict[float, str]:
@@ -166,16 +200,22 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
     modes = sorted({row["method"] for row in rows if row["method"].startswith(PEER)})
     parts = [
         PAGE.format(
-            views=settings["views"], peer=PEER, modes=", ".join(mode.removeprefix(PEER).strip() for mode in modes)
+            views=settings["views"],
+            peer=PEER,
+            modes=", ".join(mode.removeprefix(PEER).strip() for mode in modes),
         ),
         "## Scenes\n\n" + SCENES + "\n\n" + _scene_lines(rows, figures),
         *(section(figures, at) for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH),
     ]
     if table := _unlearned_table(rows, figures):
-        parts.append("## Scenes that the network was not trained on\n\n" + UNLEARNED + "\n\n" + table)
+        parts.append(
+            "## Scenes that the network was not trained on\n\n" + UNLEARNED + "\n\n" + table
+        )
     parts.append("## Time\n\n" + TIME + "\n\n" + _cost_table(figures))
     if failed := [row for row in rows if row["failed"]]:
-        lines = "\n".join(f"- {row['scene']}, {percent(row['keep'])}: {row['method']}" for row in failed)
+        lines = "\n".join(
+            f"- {row['scene']}, {percent(row['keep'])}: {row['method']}" for row in failed
+        )
         parts.append(f"## Failed\n\n{lines}")
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
@@ -194,7 +234,8 @@ def section(figures: Figures, at: int | str) -> str:
 
 
 LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
-"""Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md beside it)."""
+"""Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md
+beside it)."""
 
 SCENES = f"""No constant is chosen on [judged scenes](../benchmarks.md#scenes). They showed the need of three
 rules, whose constants come from scenes for tuning: repairs hold from nearer places (rock, taebak), merging before a
@@ -202,24 +243,39 @@ white background (ethiopianHead), and sampled views show little blur (apt_kitche
 The network of `compact` was trained on {", ".join(LEARNED)}.
 Rows of captures are older: of other sampled views, and of repairs of 48 steps."""
 
-UNLEARNED = "The gain of `compact` over `prune` in dB without the scenes of its training, in brackets with them."
+UNLEARNED = (
+    "The gain of `compact` over `prune` in dB without the scenes of its training, in brackets "
+    "with them."
+)
 
 TIME = """CPU seconds and peak memory of one process, mean (largest) over scenes. splat-transform stands for the mode of
 the best PSNR."""
 
 
 def _scene_lines(rows: list[Row], figures: Figures) -> str:
-    """All scenes with their Gaussians, by what they are judged in and by list, and what was not measured."""
+    """All scenes with their Gaussians, by what they are judged in and by list, and what was not
+    measured."""
     lists: dict[str, list[str]] = {}
-    missing, shown = [], figures.table.index.droplevel("way")
-    for (at, scene), same in sorted(grouped(rows, lambda row: (row["at"] == PHOTOS, row["scene"])).items()):
+    missing = []
+    shown = figures.table.index.droplevel("way")
+    for (at, scene), same in sorted(
+        grouped(rows, lambda row: (row["at"] == PHOTOS, row["scene"])).items()
+    ):
         there = set(shown[shown.get_level_values("scene") == scene].get_level_values("keep"))
         if gaps := [percent(keep) for keep in figures.keeps if keep not in there]:
             missing.append(f"{scene} at {', '.join(gaps)}")
-        where = f"Held-out photos, {group_of(scene) or 'other'}" if at else f"Camera path, {group_of(scene) or 'other'}"
+        where = (
+            f"Held-out photos, {group_of(scene) or 'other'}"
+            if at
+            else f"Camera path, {group_of(scene) or 'other'}"
+        )
         lists.setdefault(where, []).append(f"{scene} ({same[0]['gaussians']:,})")
     lines = "\n".join(f"- {where}: {', '.join(scenes)}." for where, scenes in lists.items())
-    return "Gaussians in brackets:\n\n" + lines + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
+    return (
+        "Gaussians in brackets:\n\n"
+        + lines
+        + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
+    )
 
 
 def _by_budget(figures: Figures, head: str, columns: dict[str, dict[float, str]]) -> str:
@@ -243,8 +299,15 @@ def _unlearned_table(rows: list[Row], figures: Figures) -> str:
     others = Figures([row for row in rows if row["scene"] not in LEARNED])
     lines = []
     for at in others.ats:
-        without, gains = (each.lead("compact", at, "covered_psnr").groupby("keep").mean() for each in (others, figures))
-        cells = [f"{without[keep]:+.2f} ({gains[keep]:+.2f})" for keep in figures.keeps if keep in without]
+        without, gains = (
+            each.lead("compact", at, "covered_psnr").groupby("keep").mean()
+            for each in (others, figures)
+        )
+        cells = [
+            f"{without[keep]:+.2f} ({gains[keep]:+.2f})"
+            for keep in figures.keeps
+            if keep in without
+        ]
         lines.append([str(at), *cells])
     return markdown(["width", *map(percent, others.keeps)], lines) if lines else ""
 
@@ -259,31 +322,46 @@ def _cost_table(figures: Figures) -> str:
                 cells.append(
                     {
                         keep: " / ".join(
-                            f"{found.loc[keep, (way, 'mean')]:.{digits}f} ({found.loc[keep, (way, 'max')]:.{digits}f})"
+                            f"{found.loc[keep, (way, 'mean')]:.{digits}f} "
+                            f"({found.loc[keep, (way, 'max')]:.{digits}f})"
                             for way in WAYS
                         )
                         for keep in found.index
                     }
                 )
-            lines += [[kind, percent(keep), *(cell[keep] for cell in cells)] for keep in (0.5, 0.1) if keep in cells[0]]
+            lines += [
+                [kind, percent(keep), *(cell[keep] for cell in cells)]
+                for keep in (0.5, 0.1)
+                if keep in cells[0]
+            ]
     ways = " / ".join(map(_way, WAYS))
     return markdown(["scenes", "kept", f"CPU seconds: {ways}", "GB"], lines) if lines else ""
 
 
 def readme_table(rows: list[Row]) -> str:
-    """The table of the README: means of all ways in the largest pictures, and the smallest leads over all pictures."""
+    """The table of the README: means of all ways in the largest pictures, and the smallest leads
+    over all pictures."""
     figures = Figures(rows)
     at = [at for at in figures.ats if at != PHOTOS][-1:] or figures.ats
     means = figures.of(at[0], "covered_psnr").groupby("keep").mean()
     leads = [
-        pd.concat([figures.lead(way, at, "covered_psnr") for at in figures.ats]).groupby("keep").min() for way in OURS
+        pd.concat([figures.lead(way, at, "covered_psnr") for at in figures.ats])
+        .groupby("keep")
+        .min()
+        for way in OURS
     ]
     lines = [
-        [percent(keep), *(f"{means.loc[keep, way]:.1f}" for way in WAYS), *(f"{lead[keep]:+.1f}" for lead in leads)]
+        [
+            percent(keep),
+            *(f"{means.loc[keep, way]:.1f}" for way in WAYS),
+            *(f"{lead[keep]:+.1f}" for lead in leads),
+        ]
         for keep in figures.keeps
         if keep in means.index
     ]
-    return markdown(["kept", *map(_way, WAYS), "smallest lead of `prune`", "of `compact` over it"], lines)
+    return markdown(
+        ["kept", *map(_way, WAYS), "smallest lead of `prune`", "of `compact` over it"], lines
+    )
 
 
 def put_between(text: str, new: str, path: Path) -> str:
@@ -320,7 +398,9 @@ def main(
     """
     rows, settings = read(files)
     if compared(rows).empty:
-        raise SystemExit(f"{', '.join(map(str, files))}: no scene has {', '.join(WAYS)} at one budget")
+        raise SystemExit(
+            f"{', '.join(map(str, files))}: no scene has {', '.join(WAYS)} at one budget"
+        )
     with_table = put_between(readme.read_text("utf-8"), readme_table(rows), readme)
     record.mkdir(parents=True, exist_ok=True)
     for name, photos in (("judge.json", False), ("judge_photos.json", True)):

@@ -1,10 +1,12 @@
-"""What refiners gain over the pruned scene, in views that were chosen by hand: several of one kind, such as seeds.
+"""What refiners gain over the pruned scene, in views that were chosen by hand: several of one kind,
+such as seeds.
 
-    python -m lab.judge.refiners scenes/rock.ply --refiners dual=RUN1 dual=RUN2 concat=RUN3 concat=RUN4 \\
+    python -m lab.judge.refiners scenes/rock.ply --refiners dual=RUN1 dual=RUN2 concat=RUN3
+    concat=RUN4 \\
         --by paper --keep 0.1 --json docs/record/encoders.json
 
-A refiner is a run of ``ns-train pointsplat``, a .safetensors file, or ``shipped``. Residuals are taken whole, and
-nothing checks them: ``pointsplat compact`` would leave out what does harm.
+A refiner is a run of ``ns-train pointsplat``, a .safetensors file, or ``shipped``. Residuals are
+taken whole, and nothing checks them: ``pointsplat compact`` would leave out what does harm.
 """
 
 from __future__ import annotations
@@ -35,8 +37,9 @@ def named(text: str) -> tuple[str, str]:
 
 
 def lines(rows: Iterable[Row]) -> list[list[str]]:
-    """Cells of :data:`HEADS` for each name, selection and budget: the number of refiners of the name, the mean of their
-    gains over scenes, and the standard deviation of these means from refiner to refiner."""
+    """Cells of :data:`HEADS` for each name, selection and budget: the number of refiners of the
+    name, the mean of their gains over scenes, and the standard deviation of these means from
+    refiner to refiner."""
     found = []
     groups = grouped(rows, lambda row: (row["method"], row["by"], row["keep"]))
     for (name, by, keep), members in groups.items():
@@ -57,10 +60,12 @@ def main(
     views: int = 6,
     json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
-    """Print what refiners gain: PSNR over the pixels that the dense scene covers, against its renders.
+    """Print what refiners gain: PSNR over the pixels that the dense scene covers, against its
+    renders.
 
     Args:
-        scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in their held-out photos.
+        scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in
+            their held-out photos.
         refiners: NAME=RUN; those of one name are averaged.
         keep: shares of the Gaussians to keep.
         by: pruning methods.
@@ -69,18 +74,31 @@ def main(
         json_path: write all rows there, after each scene.
     """
     check_options(scenes, keep, views, (width,))
-    networks = [(name, ps.load_refiner(None if path == "shipped" else path)) for name, path in map(named, refiners)]
+    networks = [
+        (name, ps.load_refiner(None if path == "shipped" else path))
+        for name, path in map(named, refiners)
+    ]
     results = Results(json_path, {"views": views, "width": width}, resume=False)
     for scene_name, path in zip(check(scenes), scenes, strict=True):
         scene = load(path, (width,), views)
-        dense, rows = DenseViews(scene.dense, scene.looks[0].views), []
+        dense = DenseViews(scene.dense, scene.looks[0].views)
+        rows = []
         for method, share in itertools.product(by, keep):
             small = ps.prune(scene.dense, keep=share, by=method)
             pruned = dense.psnr(small)
             for number, (name, network) in enumerate(networks):
-                row: Row = {"scene": scene_name, "digest": scene.digest, "keep": share, "by": method, "method": name}
+                row: Row = {
+                    "scene": scene_name,
+                    "digest": scene.digest,
+                    "keep": share,
+                    "by": method,
+                    "method": name,
+                }
                 gained = dense.psnr(ps.refine(small, network))
-                rows.append(row | {"number": number, "count": len(small), "pruned_psnr": pruned, "psnr": gained})
+                rows.append(
+                    row
+                    | {"number": number, "count": len(small), "pruned_psnr": pruned, "psnr": gained}
+                )
         results.put(scene_name, rows)
         console().print(table(scene_name, HEADS, lines(rows), left=HEADS[:2]))
     console().print(table("mean over scenes", HEADS, lines(results.rows), left=HEADS[:2]))

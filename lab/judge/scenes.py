@@ -33,9 +33,12 @@ LPIPS_WIDTH = 960
 LEAST_WIDTH = 20
 """Pixels: a lower picture is smaller than SSIM's window."""
 
-MEASURES = ("covered_psnr", *(f"{against}_{column}" for against in ("dense", "photo") for column in METRICS))
-"""What is measured: PSNR of what the dense scene covers (:func:`covered_psnr`); then each metric over all pixels,
-against the dense scene's renders and against photos."""
+MEASURES = (
+    "covered_psnr",
+    *(f"{against}_{column}" for against in ("dense", "photo") for column in METRICS),
+)
+"""What is measured: PSNR of what the dense scene covers (:func:`covered_psnr`); then each metric
+over all pixels, against the dense scene's renders and against photos."""
 
 Measures = dict[str, float | None]
 
@@ -64,8 +67,8 @@ def load(path: Path, widths: tuple[int, ...], count: int) -> JudgedScene:
     """A scene with at most ``count`` of its views, evenly spread.
 
     Args:
-        path: a PLY that has a camera path of its name, looked at in every width; or a Splatfacto run, looked at from
-            the poses of its held-out photos, in their size.
+        path: a PLY that has a camera path of its name, looked at in every width; or a Splatfacto
+            run, looked at from the poses of its held-out photos, in their size.
         widths: of the pictures of a camera path, pixels.
         count: largest number of views.
 
@@ -78,7 +81,8 @@ def load(path: Path, widths: tuple[int, ...], count: int) -> JudgedScene:
     for tensor in dense.tensors():
         digest.update(tensor.contiguous().numpy().tobytes())
     if path.suffix == ".ply":
-        name, along = path.stem, path_of(path.stem)
+        name = path.stem
+        along = path_of(path.stem)
         looks = tuple(Look(width, views_of(along, width).spread(count)) for width in widths)
         digest.update(along.read_bytes())
     else:
@@ -106,7 +110,9 @@ def check(paths: tuple[Path, ...]) -> list[str]:
     return names
 
 
-def check_options(scenes: tuple[Path, ...], keep: tuple[float, ...], views: int, widths: tuple[int, ...]) -> None:
+def check_options(
+    scenes: tuple[Path, ...], keep: tuple[float, ...], views: int, widths: tuple[int, ...]
+) -> None:
     """Check what a program is asked for.
 
     Raises:
@@ -117,7 +123,9 @@ def check_options(scenes: tuple[Path, ...], keep: tuple[float, ...], views: int,
     if not all(0 < share <= 1 for share in keep):
         raise SystemExit(f"--keep {' '.join(map(str, keep))}; expected shares above 0, at most 1")
     if views < 1 or not widths or min(widths) < LEAST_WIDTH:
-        raise SystemExit(f"{views} views of widths {widths}; expected at least 1, and {LEAST_WIDTH} pixels")
+        raise SystemExit(
+            f"{views} views of widths {widths}; expected at least 1, and {LEAST_WIDTH} pixels"
+        )
 
 
 def known_rows(results: Results, scene: JudgedScene) -> list[Row]:
@@ -138,7 +146,11 @@ class DenseViews:
 
     def __init__(self, dense: Gaussians, views: Views):
         drawn = [(view, *render_with_alpha(dense, view)) for view in views]
-        self.views = [(v, image, share) for v, image, alpha in drawn if (share := float(alpha.double().mean()))]
+        self.views = [
+            (v, image, share)
+            for v, image, alpha in drawn
+            if (share := float(alpha.double().mean()))
+        ]
         if not self.views:
             raise SystemExit("no view shows the scene; expected at least one")
 
@@ -149,13 +161,18 @@ class DenseViews:
     @torch.no_grad()
     def psnrs(self, small: Gaussians) -> list[float]:
         """:func:`covered_psnr` of each view, dB."""
-        return [covered_psnr(render(small, view), image, share) for view, image, share in self.views]
+        return [
+            covered_psnr(render(small, view), image, share) for view, image, share in self.views
+        ]
 
 
 @torch.no_grad()
-def losses(scene: JudgedScene, smalls: list[Gaussians], lpips: Lpips | None) -> Iterator[tuple[int, Look, Measures]]:
-    """What smaller scenes lose: the number of each, the look, and means over its views (:data:`MEASURES`), None where
-    there is no photo, no LPIPS, or no pixel that the dense scene covers.
+def losses(
+    scene: JudgedScene, smalls: list[Gaussians], lpips: Lpips | None
+) -> Iterator[tuple[int, Look, Measures]]:
+    """What smaller scenes lose: the number of each, the look, and means over its views
+    (:data:`MEASURES`), None where there is no photo, no LPIPS, or no pixel that the dense scene
+    covers.
 
     The dense scene is drawn once for each look, and kept until the next.
     """
@@ -170,8 +187,9 @@ def losses(scene: JudgedScene, smalls: list[Gaussians], lpips: Lpips | None) -> 
 
 
 def covered_psnr(image: Tensor, render: Tensor, covered: float) -> float:
-    """PSNR, dB, of the squared error of a picture (H, W, 3) spread over the share ``covered`` of the pixels that the
-    dense scene covers. Empty background does not make it better, and a halo beside an object makes it worse."""
+    """PSNR, dB, of the squared error of a picture (H, W, 3) spread over the share ``covered`` of
+    the pixels that the dense scene covers. Empty background does not make it better, and a halo
+    beside an object makes it worse."""
     return finite_psnr(image, render) + 10 * math.log10(covered)
 
 
@@ -188,7 +206,14 @@ def _measures(
         image = render(small, view)
         if covered[i] > 0:
             note({"covered_psnr": covered_psnr(image, renders[i], covered[i])})
-        note({f"dense_{name}": value for name, value in metrics_of(image, renders[i], lpips).items()})
+        note(
+            {f"dense_{name}": value for name, value in metrics_of(image, renders[i], lpips).items()}
+        )
         if look.photos is not None:
-            note({f"photo_{name}": value for name, value in metrics_of(image, look.photos[i], lpips).items()})
+            note(
+                {
+                    f"photo_{name}": value
+                    for name, value in metrics_of(image, look.photos[i], lpips).items()
+                }
+            )
     return {name: fmean(values[name]) if name in values else None for name in MEASURES}

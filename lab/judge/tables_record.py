@@ -2,8 +2,8 @@
 
     python -m lab.judge.tables_record docs/record/results.json
 
-The table of encoders is of ``encoders.json`` beside the page, which refiners.py measured. ``prune`` and ``compact`` are
-left out: judge.py measures them, in views that no decision used.
+The table of encoders is of ``encoders.json`` beside the page, which refiners.py measured. ``prune``
+and ``compact`` are left out: judge.py measures them, in views that no decision used.
 """
 
 from __future__ import annotations
@@ -24,9 +24,18 @@ from lab.tables.ways import WAYS
 from pointsplat_ns.io.files import replacing
 
 SHOWN = (1, 3, 4)
-"""Numbers of the tables that are shown: times need an idle machine, and Figure 4 shows its medians."""
+"""Numbers of the tables that are shown: times need an idle machine, and Figure 4 shows its
+medians."""
 
-LEFT_OUT = ("SSIM", "PSNR (renders)", "SSIM (renders)", "LPIPS (renders)", "spread", "loses most", "scenes")
+LEFT_OUT = (
+    "SSIM",
+    "PSNR (renders)",
+    "SSIM (renders)",
+    "LPIPS (renders)",
+    "spread",
+    "loses most",
+    "scenes",
+)
 """Columns that the page leaves to the measured rows."""
 
 FIGURE = "results_figure4.png"
@@ -74,7 +83,8 @@ ns-train pointsplat --data scenes --pipeline.datamanager.supervision dense --pip
 
 
 def read(path: Path) -> Tables:
-    """The tables of a file that lab.tables wrote, without the cells of ``prune`` and ``compact``."""
+    """The tables of a file that lab.tables wrote, without the cells of ``prune`` and
+    ``compact``."""
     tables = Tables.of(json.loads(path.read_text("utf-8")))
     left_out = {WAYS.merge.name, WAYS.compact.name}
     tables.cells = {key: cell for key, cell in tables.cells.items() if cell["way"] not in left_out}
@@ -82,43 +92,73 @@ def read(path: Path) -> Tables:
 
 
 def shortened(table: Table) -> Table:
-    """A table without rows that were not measured, notes and :data:`LEFT_OUT`, with PSNR and LPIPS in one cell: Table 4
-    with the parts of each model and the spread; the others with a method's shares or lambdas side by side, and Table 1
-    with what each was made with, but for its share and loss."""
-    rows = [dict(zip(table.header, row, strict=True)) for row in table.rows if "not measured" not in row]
+    """A table without rows that were not measured, notes and :data:`LEFT_OUT`, with PSNR and LPIPS
+    in one cell: Table 4 with the parts of each model and the spread; the others with a method's
+    shares or lambdas side by side, and Table 1 with what each was made with, but for its share and
+    loss."""
+    rows = [
+        dict(zip(table.header, row, strict=True)) for row in table.rows if "not measured" not in row
+    ]
     parts = [name for name in table.header if name not in (*LEFT_OUT, "PSNR", "LPIPS", "made with")]
     if table.number == 4:
-        header, lines = ["model", "parts", "PSNR/LPIPS"], []
+        header = ["model", "parts", "PSNR/LPIPS"]
+        lines = []
         for row in rows:
             spread = "" if row["spread"] == "-" else f" ± {row['spread']}"
             used = ", ".join(name for name in parts[1:] if row[name])
             lines.append([row["model"], used, f"{row['PSNR']}{spread}/{row['LPIPS']}"])
-        return dataclasses.replace(table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[])
+        return dataclasses.replace(
+            table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[]
+        )
     found = {tuple(row[name] for name in parts): row for row in rows}
     columns, methods = (list(dict.fromkeys(words[place] for words in found)) for place in (0, 1))
-    header, lines = [parts[1], *columns], []
+    header = [parts[1], *columns]
+    lines = []
     for method in methods:
         own = {column: found[column, method] for column in columns if (column, method) in found}
-        lines.append([method, *(f"{own[c]['PSNR']}/{own[c]['LPIPS']}" if c in own else "-" for c in columns)])
+        lines.append(
+            [method, *(f"{own[c]['PSNR']}/{own[c]['LPIPS']}" if c in own else "-" for c in columns)]
+        )
         if table.number == 1:  # networks of Table 3 are made like these
-            lines[-1].append("; ".join(dict.fromkeys(row["made with"].partition(", keep")[0] for row in own.values())))
+            lines[-1].append(
+                "; ".join(
+                    dict.fromkeys(row["made with"].partition(", keep")[0] for row in own.values())
+                )
+            )
     header += ["made with"] * (table.number == 1)
-    return dataclasses.replace(table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[])
+    return dataclasses.replace(
+        table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[]
+    )
 
 
 def page(tables: Tables, encoders: Path) -> str:
     """The page of all tables, that of encoders from the rows of a file of refiners.py."""
     abouts = list(tables.scenes.values())
     text = PAGE.format(
-        sizes=", ".join(f"{about['width']} x {about['height']} ({about['name']})" for about in abouts),
+        sizes=", ".join(
+            f"{about['width']} x {about['height']} ({about['name']})" for about in abouts
+        ),
         machines="\n  and ".join(sorted({about["machine"] for about in abouts})),
     )
     layouts = [Layout(tables, group, names, ()) for group, names in tables.groups().items()]
     tables_shown = [table for each in layouts for table in each.tables() if table.number in SHOWN]
-    shown = [markdown_table(table) for table in map(shortened, tables_shown) if len(table.rows) > (table.number == 4)]
-    figure = f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*"
-    compared = markdown(refiners.HEADS, refiners.lines(json.loads(encoders.read_text("utf-8"))["rows"]))
-    return "\n\n".join(part.strip() for part in (text, *shown, figure, ENCODERS.format(table=compared))) + "\n"
+    shown = [
+        markdown_table(table)
+        for table in map(shortened, tables_shown)
+        if len(table.rows) > (table.number == 4)
+    ]
+    figure = (
+        f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*"
+    )
+    compared = markdown(
+        refiners.HEADS, refiners.lines(json.loads(encoders.read_text("utf-8"))["rows"])
+    )
+    return (
+        "\n\n".join(
+            part.strip() for part in (text, *shown, figure, ENCODERS.format(table=compared))
+        )
+        + "\n"
+    )
 
 
 def main(file: tyro.conf.Positional[Path], record: Path = FOLDER) -> None:

@@ -1,14 +1,14 @@
-"""What poses are worth: a trained run is made smaller without poses, with all of its training poses, and with every
-third.
+"""What poses are worth: a trained run is made smaller without poses, with all of its training
+poses, and with every third.
 
-    python -m lab.judge.without_poses outputs/meeting/splatfacto-cpu/RUN --json without_poses.json --resume
-    python -m lab.judge.without_poses RUN --keep 0.1 --ways prune --sets sampled all
+    python -m lab.judge.without_poses outputs/meeting/splatfacto-cpu/RUN --json without_poses.json
+    --resume python -m lab.judge.without_poses RUN --keep 0.1 --ways prune --sets sampled all
 
-The run's PLY, exported to a folder of its own, is merged (``prune``) and repaired (``compact``), and compared with
-renders of the dense scene in the poses of held-out photos, at the photos' size.
+The run's PLY, exported to a folder of its own, is merged (``prune``) and repaired (``compact``),
+and compared with renders of the dense scene in the poses of held-out photos, at the photos' size.
 
-``lab/judge/captures.py`` lists the captures, and how each is made ready and trained. Choose constants on those for
-tuning.
+``lab/judge/captures.py`` lists the captures, and how each is made ready and trained. Choose
+constants on those for tuning.
 """
 
 from __future__ import annotations
@@ -27,7 +27,15 @@ import pointsplat_ns as ps
 from lab.common.printing import console, number, percent, start, table
 from lab.common.results import Results, Row
 from lab.common.ways import WAYS, Way, count_of
-from lab.judge.scenes import LEAST_WIDTH, DenseViews, JudgedScene, check, check_options, known_rows, load
+from lab.judge.scenes import (
+    LEAST_WIDTH,
+    DenseViews,
+    JudgedScene,
+    check,
+    check_options,
+    known_rows,
+    load,
+)
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
@@ -67,7 +75,12 @@ def rows_of(scene: JudgedScene, path: Path, tasks: list[Task]) -> Iterator[Row]:
             begin = time.process_time()
             small = _made(ply, count_of(keep, len(scene.dense)), method, chosen(name, poses))
             yield {
-                **{"scene": scene.name, "digest": scene.digest, "gaussians": len(scene.dense), "count": len(small)},
+                **{
+                    "scene": scene.name,
+                    "digest": scene.digest,
+                    "gaussians": len(scene.dense),
+                    "count": len(small),
+                },
                 **{"keep": keep, "method": method, "views": name, "poses": len(poses)},
                 **{"cpu_seconds": time.process_time() - begin, "psnr": judge.psnr(small)},
             }
@@ -76,7 +89,9 @@ def rows_of(scene: JudgedScene, path: Path, tasks: list[Task]) -> Iterator[Row]:
 def _made(ply: Path, count: int, way: str, views: Views | None) -> Gaussians:
     if way == "prune":
         return ps.prune(ply, count, views=views)
-    return ps.compact(ply, count, effort="thorough" if way == "thorough" else "quick", views=views).scene
+    return ps.compact(
+        ply, count, effort="thorough" if way == "thorough" else "quick", views=views
+    ).scene
 
 
 def show(rows: list[Row]) -> None:
@@ -84,12 +99,21 @@ def show(rows: list[Row]) -> None:
     found = pd.DataFrame(rows)
     found["way"] = found["method"] + ", " + found["views"]
     values = found.pivot(index=["keep", "scene"], columns="way", values="psnr")
-    order = [way for way in (f"{way}, {views}" for way, views in product(WAYS, SETS)) if way in values.columns]
+    order = [
+        way
+        for way in (f"{way}, {views}" for way, views in product(WAYS, SETS))
+        if way in values.columns
+    ]
     for keep, same in values[order].groupby("keep"):
         of_all = same.dropna()
-        lines = [(scene, *map(DB, line)) for (_, scene), line in zip(same.index, same.to_numpy(), strict=True)]
+        lines = [
+            (scene, *map(DB, line))
+            for (_, scene), line in zip(same.index, same.to_numpy(), strict=True)
+        ]
         lines += [("mean", *map(DB, of_all.mean())), ("worst", *map(DB, of_all.min()))]
-        console().print(table(f"{percent(keep)}: PSNR at the photos' size, dB", ("scene", *order), lines))
+        console().print(
+            table(f"{percent(keep)}: PSNR at the photos' size, dB", ("scene", *order), lines)
+        )
 
 
 def main(
@@ -122,8 +146,13 @@ def main(
     for name, path in zip(names, runs, strict=True):
         scene = load(path, (), views)
         rows = {task_of(row): row for row in known_rows(results, scene)}
-        tasks = [task for task in product(keep, ways, sets) if task not in rows or task[-1] in again]
-        print(f"{name}: {len(scene.dense):,} Gaussians, {len(scene.looks[0].views)} held-out poses", flush=True)
+        tasks = [
+            task for task in product(keep, ways, sets) if task not in rows or task[-1] in again
+        ]
+        print(
+            f"{name}: {len(scene.dense):,} Gaussians, {len(scene.looks[0].views)} held-out poses",
+            flush=True,
+        )
         for row in tracked(rows_of(scene, path, tasks), name, len(tasks)):
             rows[task_of(row)] = row
             results.put(name, [*rows.values()])

@@ -13,7 +13,9 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.views import Views
 
-WIDTH, HEIGHT, FOCAL = 40, 32, 44.0
+WIDTH = 40
+HEIGHT = 32
+FOCAL = 44.0
 DEPTH = 3.0
 """How far from the camera the scene's centre is, scene units."""
 
@@ -42,19 +44,25 @@ class Case:
         camera = torch.promote_types(dtype, torch.float32)
         kinds = dict.fromkeys(("means", "quats", "scales", "opacities", "sh"), dtype)
         kinds |= dict.fromkeys(("viewmat", "K"), camera)
-        return replace(self, **{name: getattr(self, name).to(kind).double() for name, kind in kinds.items()})
+        return replace(
+            self, **{name: getattr(self, name).to(kind).double() for name, kind in kinds.items()}
+        )
 
     def gaussians(self, dtype: torch.dtype) -> Gaussians:
         """The scene with logarithms and logits, rounded to ``dtype``."""
         logits = torch.logit(self.opacities)[:, None]
-        return Gaussians(self.means, self.scales.log(), self.quats, logits, self.sh[:, 0], self.sh[:, 1:]).to(dtype)
+        return Gaussians(
+            self.means, self.scales.log(), self.quats, logits, self.sh[:, 0], self.sh[:, 1:]
+        ).to(dtype)
 
     def views(self, count: int = 2) -> Views:
         """This camera and others a little beside it."""
         viewmats = self.viewmat.repeat(count, 1, 1)
         viewmats[:, 0, 3] += 0.2 * self.means.std(0).max() * torch.arange(count)
         grey = torch.full((3,), 0.3)
-        return Views(viewmats, self.K.repeat(count, 1, 1), WIDTH, HEIGHT, grey, near_plane=self.near)
+        return Views(
+            viewmats, self.K.repeat(count, 1, 1), WIDTH, HEIGHT, grey, near_plane=self.near
+        )
 
 
 def usual(n: int = GAUSSIANS, seed: int = 0) -> Case:
@@ -71,10 +79,13 @@ def usual(n: int = GAUSSIANS, seed: int = 0) -> Case:
     sh = 0.2 * randn(n, 16, 3)
     sh[:, 0] = 0.5 * randn(n, 3) / SH_C0 * 0.5
     view = torch.eye(4, dtype=torch.float64)
-    c, s = math.cos(0.2), math.sin(0.2)
+    c = math.cos(0.2)
+    s = math.sin(0.2)
     view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
     view[:3, 3] = torch.tensor([-DEPTH * s, -0.05, DEPTH * (1 - c)], dtype=torch.float64)
-    K = torch.tensor([[FOCAL, 0, 0.52 * WIDTH], [0, FOCAL, 0.47 * HEIGHT], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor(
+        [[FOCAL, 0, 0.52 * WIDTH], [0, FOCAL, 0.47 * HEIGHT], [0, 0, 1]], dtype=torch.float64
+    )
     return Case(means, randn(n, 4), scales, opacities, sh, view, K)
 
 
@@ -83,7 +94,13 @@ def in_other_units(factor: float) -> Case:
     case = usual()
     view = case.viewmat.clone()
     view[:3, 3] *= factor
-    return replace(case, means=case.means * factor, scales=case.scales * factor, viewmat=view, near=case.near * factor)
+    return replace(
+        case,
+        means=case.means * factor,
+        scales=case.scales * factor,
+        viewmat=view,
+        near=case.near * factor,
+    )
 
 
 def from_the_origin(distance: float) -> Case:
@@ -96,17 +113,22 @@ def from_the_origin(distance: float) -> Case:
 
 
 def from_the_camera(distance: float) -> Case:
-    """The usual scene that many times farther from its camera, whose focal length grows as much: the same picture."""
+    """The usual scene that many times farther from its camera, whose focal length grows as much:
+    the same picture."""
     case = usual()
-    view, K = case.viewmat.clone(), case.K.clone()
-    view[2, 3] += DEPTH * (distance - 1)  # what is at DEPTH stays in the middle, and the size of a pixel there the same
+    view = case.viewmat.clone()
+    K = case.K.clone()
+    view[2, 3] += DEPTH * (
+        distance - 1
+    )  # what is at DEPTH stays in the middle, and the size of a pixel there the same
     K[0, 0] *= distance
     K[1, 1] *= distance
     return replace(case, viewmat=view, K=K)
 
 
 def of_opacity(odds: float) -> Case:
-    """The usual scene with one opacity for all, odds / (1 + odds): 1e-2 is just drawn, 1e8 is 1 - 1e-8."""
+    """The usual scene with one opacity for all, odds / (1 + odds): 1e-2 is just drawn, 1e8 is 1 -
+    1e-8."""
     case = usual()
     return replace(case, opacities=torch.full_like(case.opacities, odds / (1 + odds)))
 
@@ -114,7 +136,11 @@ def of_opacity(odds: float) -> Case:
 def as_large_as(pixels: float) -> Case:
     """Blobs of that many pixels, faint, so that many are seen through one another."""
     case = usual()
-    return replace(case, scales=case.scales / case.scales.mean() * pixels * PIXEL, opacities=0.3 * case.opacities)
+    return replace(
+        case,
+        scales=case.scales / case.scales.mean() * pixels * PIXEL,
+        opacities=0.3 * case.opacities,
+    )
 
 
 def needles(aspect: float) -> Case:
@@ -157,7 +183,8 @@ class Sweep:
     usual: float = 1.0
     """The value of a common scene, from which limits are looked for on either side."""
     input_precision: bool = False
-    """The values are relative roundings of the type that the scene is handed over in, see :data:`PRECISIONS`."""
+    """The values are relative roundings of the type that the scene is handed over in, see
+    :data:`PRECISIONS`."""
 
     def dtype(self, value: float) -> torch.dtype:
         """What the scene is handed over in."""
@@ -171,14 +198,23 @@ def _decades(first: float, last: float, step: float = 1) -> tuple[float, ...]:
 SWEEPS = (
     Sweep("scale", "unit of length, times the usual", _decades(-36, 36, 6), in_other_units),
     Sweep("origin", "distance from the origin, scene units", _decades(0, 8), from_the_origin),
-    Sweep("camera", "distance from the camera and focal length, times the usual", _decades(0, 8), from_the_camera),
+    Sweep(
+        "camera",
+        "distance from the camera and focal length, times the usual",
+        _decades(0, 8),
+        from_the_camera,
+    ),
     Sweep("opacity", "opacity / (1 - opacity)", _decades(-2, 8), of_opacity),
     Sweep("size", "size of Gaussians, pixels", _decades(-3, 8), as_large_as),
     Sweep("needles", "length / width of needles 0.3 pixels wide", _decades(0, 7), needles),
     Sweep("discs", "width / thickness of discs 20 pixels wide", _decades(0, 8), discs),
     Sweep("count", "Gaussians", _decades(1, 3, 0.5), layers, 10.0),
     Sweep(
-        "precision", "relative rounding of the type of the input", tuple(PRECISIONS), lambda epsilon: usual(),
-        torch.finfo(torch.float32).eps, True,
+        "precision",
+        "relative rounding of the type of the input",
+        tuple(PRECISIONS),
+        lambda epsilon: usual(),
+        torch.finfo(torch.float32).eps,
+        True,
     ),
-)  # fmt: skip
+)

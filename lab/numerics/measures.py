@@ -30,8 +30,8 @@ from pointsplat_ns.refiner.refiner import gaussian_features
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
 LEAST_GRADIENT = 1e-3
-"""A kind of parameter whose gradient is below this share of the largest kind's, as that of the rotation of a ball, is
-judged by that share: there is nothing to be right about."""
+"""A kind of parameter whose gradient is below this share of the largest kind's, as that of the
+rotation of a ball, is judged by that share: there is nothing to be right about."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,8 @@ class Row:
     worst: str = ""
     """The kind of parameter that it is the error of."""
     doubt: float = 0.0
-    """Error of the fast path in float64: two formulas that disagree in float64, so at least one of them is no truth."""
+    """Error of the fast path in float64: two formulas that disagree in float64, so at least one of
+    them is no truth."""
 
 
 @dataclass(frozen=True)
@@ -64,25 +65,40 @@ class Picture:
 def measured(sweep: Sweep, value: float, compiled: bool) -> Iterator[Row]:
     """All errors of a case.
 
-    Images: largest difference of a pixel, relative to the largest value of its channel. Gradients: of a fixed random
-    sum of the image, norm of the difference relative to the norm, of the worst kind of parameter. Scores: largest
-    difference relative to their range. Costs of merging: the same, relative to each cost; pairs: share of those chosen
-    that differ. Residuals of the refiner, and the gradients of its weights: as gradients.
+    Images: largest difference of a pixel, relative to the largest value of its channel. Gradients:
+    of a fixed random sum of the image, norm of the difference relative to the norm, of the worst
+    kind of parameter. Scores: largest difference relative to their range. Costs of merging: the
+    same, relative to each cost; pairs: share of those chosen that differ. Residuals of the refiner,
+    and the gradients of its weights: as gradients.
 
     Args:
         sweep, value: which case.
         compiled: also with compiled kernels.
     """
 
-    def row(part: str, what: str, quantity: str, error: float, worst: str = "", doubt: float = 0.0) -> Row:
+    def row(
+        part: str, what: str, quantity: str, error: float, worst: str = "", doubt: float = 0.0
+    ) -> Row:
         return Row(part, what, quantity, sweep.name, value, error, worst, doubt)
 
-    case, dtype = sweep.case(value), sweep.dtype(value)
+    case = sweep.case(value)
+    dtype = sweep.dtype(value)
     given = case.rounded(dtype)
     for what, error, worst, doubt in _rasterizer(sweep, case, given, dtype, compiled):
         for quantity in error:
-            yield row("rasterizer", what, quantity, error[quantity], worst if quantity == "gradient" else "", doubt)
-    truth = case.gaussians(torch.float64) if sweep.input_precision else given.gaussians(torch.float32).to(torch.float64)
+            yield row(
+                "rasterizer",
+                what,
+                quantity,
+                error[quantity],
+                worst if quantity == "gradient" else "",
+                doubt,
+            )
+    truth = (
+        case.gaussians(torch.float64)
+        if sweep.input_precision
+        else given.gaussians(torch.float32).to(torch.float64)
+    )
     scene = (case if sweep.input_precision else given).gaussians(dtype)
     for what, quantity, error in _scores(given, scene, truth):
         yield row("scores", what, quantity, error)
@@ -100,7 +116,11 @@ def _rasterizer(sweep: Sweep, case: Case, given: Case, dtype: torch.dtype, compi
     if sweep.input_precision:
         wanted = picture(case, "reference", torch.float64)
     yield "rounded input", *errors(truth, picture(case, "reference", torch.float64)), doubt
-    yield "eager", *errors(picture(given, "eager", dtype), wanted), doubt  # it takes half precision as it is
+    yield (
+        "eager",
+        *errors(picture(given, "eager", dtype), wanted),
+        doubt,
+    )  # it takes half precision as it is
     if compiled:
         arithmetic = torch.float64 if dtype == torch.float64 else torch.float32
         yield "compiled", *errors(picture(given, "compiled", arithmetic), wanted), doubt
@@ -114,20 +134,41 @@ def picture(case: Case, what: str, dtype: torch.dtype) -> Picture:
         what: ``reference``, ``eager`` or ``compiled``.
         dtype: of the tensors handed over.
     """
-    leaves = {name: getattr(case, name).to(dtype, copy=True).requires_grad_() for name in PARAMETERS}
+    leaves = {
+        name: getattr(case, name).to(dtype, copy=True).requires_grad_() for name in PARAMETERS
+    }
     camera = torch.promote_types(dtype, torch.float32)
-    view, K = case.viewmat.to(camera), case.K.to(camera)
+    view = case.viewmat.to(camera)
+    K = case.K.to(camera)
     if what == "reference":
         image, alpha, depth = rasterize_reference(
-            *leaves.values(), view, K, WIDTH, HEIGHT, case.near, math.inf, sh_degree=3, antialiased=case.antialiased
+            *leaves.values(),
+            view,
+            K,
+            WIDTH,
+            HEIGHT,
+            case.near,
+            math.inf,
+            sh_degree=3,
+            antialiased=case.antialiased,
         )
     else:
         renders, alphas, _ = rasterization(
-            *leaves.values(), view[None], K[None], WIDTH, HEIGHT, case.near, math.inf, sh_degree=3,
-            render_mode="RGB+D", rasterize_mode="antialiased" if case.antialiased else "classic",
+            *leaves.values(),
+            view[None],
+            K[None],
+            WIDTH,
+            HEIGHT,
+            case.near,
+            math.inf,
+            sh_degree=3,
+            render_mode="RGB+D",
+            rasterize_mode="antialiased" if case.antialiased else "classic",
             compiled=what == "compiled",
-        )  # fmt: skip
-        image, alpha, depth = renders[0, ..., :3], alphas[0], renders[0, ..., 3:]
+        )
+        image = renders[0, ..., :3]
+        alpha = alphas[0]
+        depth = renders[0, ..., 3:]
     far = float(torch.linalg.vector_norm(case.means - _centre(case), dim=1).max())
     pixels = torch.cat([image, alpha, depth / far], dim=-1)
     generator = torch.Generator().manual_seed(1)
@@ -150,7 +191,9 @@ def _centre(case: Case) -> Tensor:
 
 def errors(got: Picture, wanted: Picture) -> tuple[dict[str, float], str]:
     """Relative errors of image and gradient, and the kind of parameter with the worst gradient."""
-    off = (got.pixels - wanted.pixels).abs().amax((0, 1)) / wanted.pixels.abs().amax((0, 1)).clamp_min(1e-300)
+    off = (got.pixels - wanted.pixels).abs().amax((0, 1)) / wanted.pixels.abs().amax(
+        (0, 1)
+    ).clamp_min(1e-300)
     error, worst = _worst(got.grads, wanted.grads)
     return {"image": _finite(off.max()), "gradient": error}, worst
 
@@ -178,7 +221,8 @@ def _scores(given: Case, scene: Gaussians, truth: Gaussians) -> Iterator[tuple[s
         "PUP-3DGS": functools.partial(pup_score, views=views),
     }
     for name, score in kinds.items():
-        got, wanted = score(scene).double(), score(truth)
+        got = score(scene).double()
+        wanted = score(truth)
         same = got.isfinite() == wanted.isfinite()
         both = got.isfinite() & wanted.isfinite()
         span = wanted[both].max() - wanted[both].min() if bool(both.any()) else torch.zeros(())
@@ -189,13 +233,15 @@ def _scores(given: Case, scene: Gaussians, truth: Gaussians) -> Iterator[tuple[s
 
 def _merge(given: Case, scene: Gaussians, truth: Gaussians) -> dict[str, float]:
     centre, size = content_size(truth)  # of equal Gaussians it is a matter of ties, and only a unit
-    everyone, equal = torch.arange(len(truth)), torch.ones(len(truth))
+    everyone = torch.arange(len(truth))
+    equal = torch.ones(len(truth))
     states = [
         initial_state(Participants(part, everyone, centre, size), equal, dtype=dtype)
         for part, dtype in ((scene, torch.float32), (truth, torch.float64))
     ]
     near = other_neighbours(states[1].means, MERGING.neighbours)
-    costs, wanted = pair_costs(states[0], near), pair_costs(states[1], near, dtype=torch.float64)
+    costs = pair_costs(states[0], near)
+    wanted = pair_costs(states[1], near, dtype=torch.float64)
     there = near != torch.arange(len(near))[:, None]
     most = max(1, len(truth) // 2)
     chosen = [_pairs(near, values, most) for values in (costs, wanted)]
@@ -215,7 +261,9 @@ def _pairs(near: Tensor, costs: Tensor, most: int) -> set[tuple[int, int]]:
 
 
 def _colours(scene: Gaussians, case: Case) -> Tensor:
-    return ps.render(scene, replace(case.views(1)[0], background=torch.zeros(3, dtype=torch.float64)))
+    return ps.render(
+        scene, replace(case.views(1)[0], background=torch.zeros(3, dtype=torch.float64))
+    )
 
 
 @functools.cache
@@ -226,13 +274,18 @@ def refiners() -> tuple[Refiner, Refiner]:
 
 
 def _refiner(scene: Gaussians, truth: Gaussians) -> dict[str, tuple[float, str]]:
-    single, double = (_residuals(network, part) for network, part in zip(refiners(), (scene, truth), strict=True))
+    single, double = (
+        _residuals(network, part) for network, part in zip(refiners(), (scene, truth), strict=True)
+    )
     names = ("residual", "gradient")
-    return {name: _worst(got, wanted) for name, got, wanted in zip(names, single, double, strict=True)}
+    return {
+        name: _worst(got, wanted) for name, got, wanted in zip(names, single, double, strict=True)
+    }
 
 
 def _residuals(network: Refiner, scene: Gaussians) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Residuals by attribute, and the gradients of a fixed random sum of them by each group of weights."""
+    """Residuals by attribute, and the gradients of a fixed random sum of them by each group of
+    weights."""
     structure = network.prepare(scene)
     if structure is None:
         raise RuntimeError("no Gaussian of the case can be drawn")
@@ -244,7 +297,11 @@ def _residuals(network: Refiner, scene: Gaussians) -> tuple[dict[str, Tensor], d
         weights = torch.rand(value.shape, generator=generator, dtype=torch.float64)
         total = total + (value * weights.to(value)).sum()
     groups = network.parameter_groups()
-    grads = torch.autograd.grad(total, [p for group in groups.values() for p in group], materialize_grads=True)
+    grads = torch.autograd.grad(
+        total, [p for group in groups.values() for p in group], materialize_grads=True
+    )
     flat = iter(grads)
-    by_group = {name: torch.cat([next(flat).flatten() for _ in group]) for name, group in groups.items()}
+    by_group = {
+        name: torch.cat([next(flat).flatten() for _ in group]) for name, group in groups.items()
+    }
     return {name: value.detach() for name, value in residuals.items()}, by_group

@@ -29,7 +29,11 @@ def _rotation(quat: Tensor) -> Tensor:
     q = torch.stack([x, y, z])
     zero = torch.zeros_like(w)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-    return (w * w - q @ q) * torch.eye(3, dtype=quat.dtype, device="cpu") + 2 * torch.outer(q, q) + 2 * w * cross
+    return (
+        (w * w - q @ q) * torch.eye(3, dtype=quat.dtype, device="cpu")
+        + 2 * torch.outer(q, q)
+        + 2 * w * cross
+    )
 
 
 def _det(m: Tensor) -> Tensor:
@@ -53,10 +57,16 @@ def rasterize_reference(
     eps2d: float = EPS2D,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One camera's image over black (H, W, D), alphas (H, W, 1) and summed depths (H, W, 1)."""
-    W, t = viewmat[:3, :3], viewmat[:3, 3]
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    W = viewmat[:3, :3]
+    t = viewmat[:3, 3]
+    fx = K[0, 0]
+    fy = K[1, 1]
+    cx = K[0, 2]
+    cy = K[1, 2]
     points = means @ W.T + t
-    ys, xs = torch.meshgrid(torch.arange(height, **FLOATS) + 0.5, torch.arange(width, **FLOATS) + 0.5, indexing="ij")
+    ys, xs = torch.meshgrid(
+        torch.arange(height, **FLOATS) + 0.5, torch.arange(width, **FLOATS) + 0.5, indexing="ij"
+    )
     pixels = torch.stack([xs, ys], -1).to(means.dtype)
     through = torch.ones(height, width, dtype=means.dtype, device="cpu")
     alive = torch.ones(height, width, **FLAGS)
@@ -66,12 +76,21 @@ def rasterize_reference(
     for i in torch.argsort(points[:, 2].detach(), stable=True).tolist():
         x, y, z = points[i]
         parameters = torch.cat([points[i], quats[i], scales[i], opacities[i, None]])
-        if not parameters.isfinite().all() or (scales[i] < 0).any() or not near_plane < z < far_plane:
+        if (
+            not parameters.isfinite().all()
+            or (scales[i] < 0).any()
+            or not near_plane < z < far_plane
+        ):
             continue
         # Jacobian of the projection, evaluated inside the enlarged field of view
-        half_x, half_y = 0.5 * width / fx, 0.5 * height / fy
-        tx = z * torch.clamp(x / z, -cx / fx - FRUSTUM_MARGIN * half_x, (width - cx) / fx + FRUSTUM_MARGIN * half_x)
-        ty = z * torch.clamp(y / z, -cy / fy - FRUSTUM_MARGIN * half_y, (height - cy) / fy + FRUSTUM_MARGIN * half_y)
+        half_x = 0.5 * width / fx
+        half_y = 0.5 * height / fy
+        tx = z * torch.clamp(
+            x / z, -cx / fx - FRUSTUM_MARGIN * half_x, (width - cx) / fx + FRUSTUM_MARGIN * half_x
+        )
+        ty = z * torch.clamp(
+            y / z, -cy / fy - FRUSTUM_MARGIN * half_y, (height - cy) / fy + FRUSTUM_MARGIN * half_y
+        )
         zero = torch.zeros_like(z)
         J = torch.stack([fx / z, zero, -fx * tx / z**2, zero, fy / z, -fy * ty / z**2]).view(2, 3)
         R = _rotation(quats[i])

@@ -11,10 +11,12 @@ from lab.numerics.cases import SWEEPS, Sweep
 from lab.numerics.measures import Row
 
 TRUSTED = 1e-2
-"""Relative error up to which a result is trusted: 2.5 steps of an 8-bit image, 1 % of a gradient."""
+"""Relative error up to which a result is trusted: 2.5 steps of an 8-bit image, 1 % of a
+gradient."""
 
 MOST_DOUBT = 1e-3
-"""Where the reference and the fast path, both in float64, are farther apart than this, nothing is judged."""
+"""Where the reference and the fast path, both in float64, are farther apart than this, nothing is
+judged."""
 
 DRAWN = (1e-9, 10.0)
 """Smaller and larger errors, and what is not finite, are drawn here."""
@@ -36,7 +38,8 @@ OTHERS: dict[Curve, str] = {
 
 
 def limits(rows: Sequence[Row], sweep: Sweep) -> tuple[str, bool]:
-    """How far a curve is trusted, from the usual value to either side, and whether it ends where nothing is judged.
+    """How far a curve is trusted, from the usual value to either side, and whether it ends where
+    nothing is judged.
 
     Args:
         rows: of one curve and sweep, ascending.
@@ -53,7 +56,8 @@ def limits(rows: Sequence[Row], sweep: Sweep) -> tuple[str, bool]:
     start = min(range(len(rows)), key=lambda i: abs(math.log(rows[i].value / sweep.usual)))
     if rows[start].error > TRUSTED:
         return "nowhere", False
-    ends, unjudged = [], False
+    ends = []
+    unjudged = False
     for side in (range(start, -1, -1), range(start, len(rows))):
         held = start
         for i in side:
@@ -84,7 +88,11 @@ def curve(rows: Sequence[Row], sweep: str, what: str, quantity: str) -> list[Row
 def tables(rows: Sequence[Row]) -> str:
     """Two Markdown tables: how far rasterizers are trusted, and how far everything else is."""
     used = [name for name in RASTERIZERS if any(row.what == name for row in rows)]
-    first = {(name, kind): f"{RASTERIZERS[name]}: {kind}" for name in used for kind in ("image", "gradient")}
+    first = {
+        (name, kind): f"{RASTERIZERS[name]}: {kind}"
+        for name in used
+        for kind in ("image", "gradient")
+    }
     return "\n\n".join(_table(rows, curves) for curves in (first, OTHERS))
 
 
@@ -103,7 +111,9 @@ def _table(rows: Sequence[Row], curves: dict[Curve, str]) -> str:
             if text == "all":
                 text = f"all ({worst:.0e})" if worst else "all (0)"
             cells.append(text + ("\\*" if unjudged else ""))
-        lines.append([sweep.label, f"{_number(sweep.values[0])} to {_number(sweep.values[-1])}", *cells])
+        lines.append(
+            [sweep.label, f"{_number(sweep.values[0])} to {_number(sweep.values[-1])}", *cells]
+        )
     return markdown(["Driven", "Measured", *curves.values()], lines)
 
 
@@ -117,14 +127,22 @@ def plot(rows: Sequence[Row], folder: Path) -> None:
         for kind, style in styles.items()
     }
     others = {
-        key: (label, f"C{i}", "-" if i < 3 else "--" if i < 5 else ":") for i, (key, label) in enumerate(OTHERS.items())
+        key: (label, f"C{i}", "-" if i < 3 else "--" if i < 5 else ":")
+        for i, (key, label) in enumerate(OTHERS.items())
     }
     title = "Error of {} in float32 against {}float64{}"
-    _plot(rows, rasterizers, folder / "rasterizer.png", title.format("the rasterizer", "the ", " reference"))
+    _plot(
+        rows,
+        rasterizers,
+        folder / "rasterizer.png",
+        title.format("the rasterizer", "the ", " reference"),
+    )
     _plot(rows, others, folder / "others.png", title.format("merging, scores and refiner", "", ""))
 
 
-def _plot(rows: Sequence[Row], curves: dict[Curve, tuple[str, str, str]], path: Path, title: str) -> None:
+def _plot(
+    rows: Sequence[Row], curves: dict[Curve, tuple[str, str, str]], path: Path, title: str
+) -> None:
     from matplotlib.figure import Figure
 
     sweeps = _measured(rows)
@@ -133,9 +151,19 @@ def _plot(rows: Sequence[Row], curves: dict[Curve, tuple[str, str, str]], path: 
     axes = figure.subplots(lines, 3, squeeze=False, sharey=True).flatten()
     for axis, sweep in zip(axes, sweeps, strict=False):
         for (what, quantity), (label, colour, style) in curves.items():
-            here = [row for row in curve(rows, sweep.name, what, quantity) if row.doubt <= MOST_DOUBT]
+            here = [
+                row for row in curve(rows, sweep.name, what, quantity) if row.doubt <= MOST_DOUBT
+            ]
             heights = [min(max(row.error, DRAWN[0]), DRAWN[1]) for row in here]
-            axis.plot([row.value for row in here], heights, style, color=colour, label=label, marker=".", markersize=4)
+            axis.plot(
+                [row.value for row in here],
+                heights,
+                style,
+                color=colour,
+                label=label,
+                marker=".",
+                markersize=4,
+            )
         axis.axhline(TRUSTED, color="black", linewidth=0.8)
         axis.set(xscale="log", yscale="log", ylim=(DRAWN[0] / 2, DRAWN[1] * 2))
         axis.set_xlabel(sweep.label, fontsize=8)
@@ -145,6 +173,8 @@ def _plot(rows: Sequence[Row], curves: dict[Curve, tuple[str, str, str]], path: 
         axis.set_axis_off()
     for axis in axes[::3]:
         axis.set_ylabel("relative error")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8
+    )
     figure.suptitle(title, fontsize=11)
     save_figure(figure, path, dpi=80)

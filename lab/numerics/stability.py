@@ -1,10 +1,12 @@
-"""Where float32 stops being trustworthy, against float64: rasterizer, scores, merging and refiner, over decades.
+"""Where float32 stops being trustworthy, against float64: rasterizer, scores, merging and refiner,
+over decades.
 
     OMP_NUM_THREADS=1 python -m lab.numerics.stability --output outputs/stability
 
-Small scenes are driven to extremes of one property each (:mod:`lab.numerics.cases`), and the errors that this makes are
-measured (:mod:`lab.numerics.measures`). What is compared has the same input, rounded to float32 first: the error is
-that of the arithmetic. The truth of images and gradients is the package's per-pixel reference in float64.
+Small scenes are driven to extremes of one property each (:mod:`lab.numerics.cases`), and the errors
+that this makes are measured (:mod:`lab.numerics.measures`). What is compared has the same input,
+rounded to float32 first: the error is that of the arithmetic. The truth of images and gradients is
+the package's per-pixel reference in float64.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ def main(
     """
     unknown = set(sweeps) - {sweep.name for sweep in SWEEPS}
     if unknown:
-        raise SystemExit(f"no sweep {', '.join(sorted(unknown))}; expected {', '.join(s.name for s in SWEEPS)}")
+        raise SystemExit(
+            f"no sweep {', '.join(sorted(unknown))}; expected {', '.join(s.name for s in SWEEPS)}"
+        )
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     cases = [(sweep, value) for sweep in SWEEPS if sweep.name in sweeps for value in sweep.values]
@@ -48,7 +52,10 @@ def main(
         errors = {"torch": torch.__version__, "trusted": TRUSTED, "errors": list(map(asdict, rows))}
         write_json(output / "stability.json", errors)
     plot(rows, output)
-    print(f"trusted up to a relative error of {TRUSTED}; torch {torch.__version__}, {torch.get_num_threads()} threads")
+    print(
+        f"trusted up to a relative error of {TRUSTED}; torch {torch.__version__}, "
+        f"{torch.get_num_threads()} threads"
+    )
     print(f"{len(rows)} errors in {time.perf_counter() - started:.0f} s; in brackets the largest\n")
     print(tables(rows))
 

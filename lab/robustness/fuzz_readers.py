@@ -1,8 +1,9 @@
 """Every reader of files that a stranger may have written, as a function of bytes.
 
-A reader gets a folder of its own, in which it lays out what belongs to the file, and gives a function that puts bytes
-into the file's place and reads it as users do. Where a file is compressed or has check sums, the bytes are what is
-inside: changed at random outside, it would be refused at once.
+A reader gets a folder of its own, in which it lays out what belongs to the file, and gives a
+function that puts bytes into the file's place and reads it as users do. Where a file is compressed
+or has check sums, the bytes are what is inside: changed at random outside, it would be refused at
+once.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ def at(
 
     Args:
         file: its name in the folder.
-        read: function of its path, or where that is: ``module:name``, imported when the reader is made.
+        read: function of its path, or where that is: ``module:name``, imported when the reader is
+            made.
         lay_out: puts what belongs to the file into the folder.
         inside: makes the file of the bytes that are inside it.
     """
@@ -100,7 +102,9 @@ READERS |= {
     "sog-meta": at("meta.json", _in_folder, _sog_folder),
     "sog-image": at("quats.webp", _in_folder, _sog_folder),
     "zip": at("a.zip", _scene),  # as they are
-    "checkpoint": at("a.ckpt", _scene),  # as they are: zip archives, or the pickles of earlier versions of torch
+    "checkpoint": at(
+        "a.ckpt", _scene
+    ),  # as they are: zip archives, or the pickles of earlier versions of torch
 }
 
 
@@ -118,7 +122,10 @@ def _checkpoint_bytes(scene: Gaussians) -> bytes:
 
 def gsplat_bytes(scene: Gaussians) -> bytes:
     """A checkpoint of gsplat's trainer."""
-    values = dict(scene.items()) | {"opacities": scene.opacities[:, 0], "sh0": scene.features_dc[:, None]}
+    values = dict(scene.items()) | {
+        "opacities": scene.opacities[:, 0],
+        "sh0": scene.features_dc[:, None],
+    }
     values["shN"] = values.pop("features_rest")
     del values["features_dc"]
     return _saved({"step": 1, "splats": values})
@@ -154,7 +161,11 @@ def _safetensors(header: bytes, numbers: int) -> bytes:
 def _with_zeros(header: bytes) -> bytes:
     """A safetensors file of a header; as many zeros follow as it says."""
     try:
-        ends = [entry["data_offsets"][1] for name, entry in json.loads(header).items() if name != "__metadata__"]
+        ends = [
+            entry["data_offsets"][1]
+            for name, entry in json.loads(header).items()
+            if name != "__metadata__"
+        ]
         numbers = min(max(ends, default=0), 1 << 16)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
         numbers = 0
@@ -166,12 +177,23 @@ def _refiner_metadata(folder: Path) -> Read:
     from pointsplat_ns.compression.trained_refiner import load_refiner
     from pointsplat_ns.refiner import Refiner, RefinerConfig
 
-    sizes = {"grid": None, "enc_channels": (2,), "enc_depths": (1,), "enc_heads": (1,), "strides": (), "patch": 4}
+    sizes = {
+        "grid": None,
+        "enc_channels": (2,),
+        "enc_depths": (1,),
+        "enc_heads": (1,),
+        "strides": (),
+        "patch": 4,
+    }
     none = {"dec_channels": (), "dec_depths": (), "dec_heads": ()}
-    config = RefinerConfig(sh_degree=1, **sizes, **none, head_width=2, head_depth=2, feature_dim=2, color_hidden=2)
-    tensors, end = {}, 0
+    config = RefinerConfig(
+        sh_degree=1, **sizes, **none, head_width=2, head_depth=2, feature_dim=2, color_hidden=2
+    )
+    tensors = {}
+    end = 0
     for name, value in Refiner(config).state_dict().items():
-        begin, end = end, end + value.numel() * value.element_size()
+        begin = end
+        end = end + value.numel() * value.element_size()
         kind = {torch.float32: "F32", torch.int64: "I64"}[value.dtype]
         tensors[name] = {"dtype": kind, "shape": list(value.shape), "data_offsets": [begin, end]}
     rest = json.dumps(tensors).encode()[1:]
@@ -207,13 +229,16 @@ def _run(folder: Path) -> None:
     for place in ("nerfstudio_models", "data/images"):
         (folder / place).mkdir(parents=True)
     (folder / "config.yml").write_bytes(CONFIG)
-    (folder / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(_checkpoint_bytes(some_scene()))
+    (folder / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(
+        _checkpoint_bytes(some_scene())
+    )
     for index in range(3):
         Image.new("RGB", (8, 6)).save(folder / "data" / "images" / f"{index}.png")
 
 
 def _use_run(path: Path) -> object:
-    """What a run's ``config.yml`` says: what the run is, its data, its name, its network if it is a refiner's."""
+    """What a run's ``config.yml`` says: what the run is, its data, its name, its network if it is a
+    refiner's."""
     from pointsplat_ns.compression.trained_refiner import load_refiner
     from pointsplat_ns.io.runs import name_of, open_run
 
@@ -241,7 +266,9 @@ def _use_dataset(path: Path) -> object:
 
 def _transforms(folder: Path) -> None:
     rows = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
-    (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": rows, "scale": 0.5}))
+    (folder / "dataparser_transforms.json").write_text(
+        json.dumps({"transform": rows, "scale": 0.5})
+    )
 
 
 def _colmap(suffix: str) -> Callable[[Path], None]:
@@ -285,7 +312,9 @@ def _use_replica(path: Path) -> object:
 
 READERS |= {
     "refiner-metadata": _refiner_metadata,
-    "weights": at("a.safetensors", "pointsplat_ns.refiner.feedback:read_feedback_refiner", inside=_with_zeros),
+    "weights": at(
+        "a.safetensors", "pointsplat_ns.refiner.feedback:read_feedback_refiner", inside=_with_zeros
+    ),
     "config": at("config.yml", _use_run, _run),
     "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.io.runs:read_transforms"),
     "dataset": at("data/transforms.json", _use_dataset, _run),

@@ -1,4 +1,5 @@
-"""Built-in synthetic rooms: procedural, furnished, lit, with highlights that move with the viewer."""
+"""Built-in synthetic rooms: procedural, furnished, lit, with highlights that move with the
+viewer."""
 
 from lab.rooms.render import default_intrinsics, render_room
 from lab.rooms.room import Room, make_room

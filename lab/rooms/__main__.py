@@ -34,7 +34,9 @@ def main(
         height: height of a photo, pixels.
     """
     if not seeds:
-        raise DataError("--seeds without a value: expected the seed of each room, such as --seeds 0 1")
+        raise DataError(
+            "--seeds without a value: expected the seed of each room, such as --seeds 0 1"
+        )
     for seed in seeds:
         room = output / f"room{seed}"
         if is_written(room, frames, width, height):

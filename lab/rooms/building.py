@@ -17,7 +17,9 @@ class Material:
     paint: Painter  # its colour, linear light
     gloss: float = 0.0  # strength of the highlight, 0 for a matte surface
     shininess: float = 50.0  # Blinn-Phong exponent
-    emission: float = 0.0  # radiance of a light-emitting surface as a multiple of its colour; 0 for the others
+    emission: float = (
+        0.0  # radiance of a light-emitting surface as a multiple of its colour; 0 for the others
+    )
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,8 @@ class Light:
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """Coordinates of a piece of furniture: origin (x, y) on the floor, turned about z by quarter turns."""
+    """Coordinates of a piece of furniture: origin (x, y) on the floor, turned about z by quarter
+    turns."""
 
     x: float
     y: float
@@ -73,8 +76,9 @@ class Builder:
         round: bool = False,
         opaque: bool = True,
     ) -> None:
-        """A box, or the ellipsoid that fits in it, of full extents ``size`` in the frame. ``front`` is the material of
-        the face in the frame's direction of +y, if it differs; what is not ``opaque`` casts no shadow."""
+        """A box, or the ellipsoid that fits in it, of full extents ``size`` in the frame. ``front``
+        is the material of the face in the frame's direction of +y, if it differs; what is not
+        ``opaque`` casts no shadow."""
         x, y, z = at.vector(size)
         self.rows.append((at.point(center), (abs(x) / 2, abs(y) / 2, z / 2), round, opaque))
         faces = [material] * 6

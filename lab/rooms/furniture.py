@@ -1,7 +1,8 @@
 """The colours of a room, and its pieces of furniture.
 
-A piece is built in its own frame: x along the wall, y from the wall into the room, z up, the middle of its back edge at
-the origin (for a table, a chair and an ornament: the middle of its foot). ``size`` is width, depth and height, metres.
+A piece is built in its own frame: x along the wall, y from the wall into the room, z up, the middle
+of its back edge at the origin (for a table, a chair and an ornament: the middle of its foot).
+``size`` is width, depth and height, metres.
 """
 
 import colorsys
@@ -24,7 +25,10 @@ class Palette:
     def __init__(self, rng: np.random.Generator):
         hue = rng.random()
         self.rng = rng
-        self.accents = [hsv(hue + d, rng.uniform(0.5, 0.85), rng.uniform(0.45, 0.85)) for d in (0.0, 0.08, 0.33, 0.5)]
+        self.accents = [
+            hsv(hue + d, rng.uniform(0.5, 0.85), rng.uniform(0.45, 0.85))
+            for d in (0.0, 0.08, 0.33, 0.5)
+        ]
         self.wall = hsv(rng.random(), rng.uniform(0.05, 0.28), rng.uniform(0.78, 0.92))
         self.timber = hsv(rng.uniform(0.04, 0.1), rng.uniform(0.4, 0.65), rng.uniform(0.4, 0.85))
         self.pale = hsv(rng.uniform(0.05, 0.15), 0.08, 0.9)
@@ -36,10 +40,16 @@ class Palette:
         return self.accents[self.rng.integers(len(self.accents))]
 
     def cloth(self) -> Material:
-        return Material(tex.fabric(self.accent(), self.accent(), float(self.rng.choice([0.0, 0.0, 0.28, 0.4]))))
+        return Material(
+            tex.fabric(self.accent(), self.accent(), float(self.rng.choice([0.0, 0.0, 0.28, 0.4])))
+        )
 
     def lacquer(self) -> Material:
-        return Material(tex.plain(self.accent(), 0.15, 0.12), gloss=0.35, shininess=float(self.rng.uniform(40, 110)))
+        return Material(
+            tex.plain(self.accent(), 0.15, 0.12),
+            gloss=0.35,
+            shininess=float(self.rng.uniform(40, 110)),
+        )
 
 
 def bookshelf(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
@@ -52,21 +62,36 @@ def bookshelf(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     for k in range(shelves + 1):
         b.box(at, (0, d / 2, 0.015 + k * step), (w, d, 0.03), pal.wood)
     for k in range(shelves):
-        tall, fill = (step - 0.03) * pal.rng.uniform(0.75, 0.92), (w - 0.06) * pal.rng.uniform(0.55, 1.0)
-        row = Material(tex.stripes([*pal.rng.permutation([*pal.accents, pal.pale, *pal.accents])], 0.045), gloss=0.03)
-        b.box(at, ((fill - w) / 2 + 0.03, 0.4 * d, 0.03 + k * step + tall / 2), (fill, 0.72 * d, tall), row)
+        tall = (step - 0.03) * pal.rng.uniform(0.75, 0.92)
+        fill = (w - 0.06) * pal.rng.uniform(0.55, 1.0)
+        row = Material(
+            tex.stripes([*pal.rng.permutation([*pal.accents, pal.pale, *pal.accents])], 0.045),
+            gloss=0.03,
+        )
+        b.box(
+            at,
+            ((fill - w) / 2 + 0.03, 0.4 * d, 0.03 + k * step + tall / 2),
+            (fill, 0.72 * d, tall),
+            row,
+        )
 
 
 def sofa(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
-    cloth, third = pal.cloth(), (w - 0.36) / 3
+    cloth = pal.cloth()
+    third = (w - 0.36) / 3
     b.box(at, (0, d / 2, 0.19), (w, d, 0.38), cloth)
     b.box(at, (0, 0.11, h / 2), (w, 0.22, h), cloth)
     for side in (-1, 1):
         b.box(at, (side * (w - 0.18) / 2, d / 2, 0.3), (0.18, d, 0.6), cloth)
         b.box(at, (side * (w / 2 - 0.4), 0.34, 0.66), (0.4, 0.2, 0.38), pal.cloth(), round=True)
     for k in (-1, 0, 1):
-        b.box(at, (k * third, 0.11 + d / 2, 0.44), (third - 0.02, d - 0.24, 0.12), cloth if k else pal.cloth())
+        b.box(
+            at,
+            (k * third, 0.11 + d / 2, 0.44),
+            (third - 0.02, d - 0.24, 0.12),
+            cloth if k else pal.cloth(),
+        )
 
 
 def wardrobe(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
@@ -110,9 +135,19 @@ def table(b: Builder, at: LocalFrame, pal: Palette, size: Vec) -> None:
     w, d, h = size
     b.box(at, (0, 0, h - 0.02), (w, d, 0.04), pal.wood)
     for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-        b.box(at, (x * (w / 2 - 0.06), y * (d / 2 - 0.06), (h - 0.04) / 2), (0.06, 0.06, h - 0.04), pal.wood)
+        b.box(
+            at,
+            (x * (w / 2 - 0.06), y * (d / 2 - 0.06), (h - 0.04) / 2),
+            (0.06, 0.06, h - 0.04),
+            pal.wood,
+        )
     ornament(b, at.moved(0.15 * w, 0), pal, h)
-    b.box(at, (-0.22 * w, 0.05, h + 0.02), (0.3, 0.22, 0.04), Material(tex.picture(pal.accents), gloss=0.1))
+    b.box(
+        at,
+        (-0.22 * w, 0.05, h + 0.02),
+        (0.3, 0.22, 0.04),
+        Material(tex.picture(pal.accents), gloss=0.1),
+    )
 
 
 def ornament(b: Builder, at: LocalFrame, pal: Palette, z: float) -> None:

@@ -1,8 +1,8 @@
 """Textures and light of a room, computed once and looked up by every render.
 
-Colours are mip-mapped grids of texels, one for each chart. Light that does not depend on the viewer (direct light with
-soft shadows, and ambient light with ambient occlusion) is a coarser grid, together with the visible share of each
-light, which highlights need.
+Colours are mip-mapped grids of texels, one for each chart. Light that does not depend on the viewer
+(direct light with soft shadows, and ambient light with ambient occlusion) is a coarser grid,
+together with the visible share of each light, which highlights need.
 """
 
 import math
@@ -34,10 +34,12 @@ LIGHT = LightSettings()
 
 @dataclass(frozen=True)
 class ChartGrids:
-    """Grids of values on all charts, one after the other, in several levels, each of half the last one's resolution.
+    """Grids of values on all charts, one after the other, in several levels, each of half the last
+    one's resolution.
 
     Attributes:
-        data: (T, C) values; chart c at level l starts at ``start[c, l]``, in rows of ``columns[c, l]``.
+        data: (T, C) values; chart c at level l starts at ``start[c, l]``, in rows of ``columns[c,
+            l]``.
         start, columns, rows: int64 (charts, levels).
         spacing: (charts,), metres between points of level 0.
     """
@@ -50,30 +52,46 @@ class ChartGrids:
 
     @classmethod
     def of(cls, images: list[Tensor], spacing: list[float], levels: int) -> "ChartGrids":
-        """The grids of images (C, rows, columns), one for each chart, halved until there are so many levels."""
+        """The grids of images (C, rows, columns), one for each chart, halved until there are so
+        many levels."""
         pyramids = []
         for image in images:
             pyramids.append([image])
             for _ in range(levels - 1):
-                image = F.adaptive_avg_pool2d(image, (max(1, image.shape[1] // 2), max(1, image.shape[2] // 2)))
+                image = F.adaptive_avg_pool2d(
+                    image, (max(1, image.shape[1] // 2), max(1, image.shape[2] // 2))
+                )
                 pyramids[-1].append(image)
-        shapes = torch.tensor([[image.shape[1:] for image in pyramid] for pyramid in pyramids], **INDICES)
+        shapes = torch.tensor(
+            [[image.shape[1:] for image in pyramid] for pyramid in pyramids], **INDICES
+        )
         counts = shapes.prod(-1).reshape(-1)
         data = torch.cat([image.flatten(1).T for pyramid in pyramids for image in pyramid])
         start = (counts.cumsum(0) - counts).view(len(images), levels)
         return cls(data, start, shapes[..., 1], shapes[..., 0], torch.tensor(spacing, **FLOATS))
 
     def sample(self, chart: Tensor, u: Tensor, v: Tensor, footprint: Tensor) -> Tensor:
-        """Value (M, C) of samples that cover ``footprint`` metres (M,): bilinear, in the level nearest to that;
-        clamped at the charts' borders."""
-        level = torch.log2(footprint / self.spacing[chart]).round().clamp(0, self.start.shape[1] - 1).long()
-        start, columns, rows = self.start[chart, level], self.columns[chart, level], self.rows[chart, level]
-        x, y = (u * columns - 0.5).clamp(min=0), (v * rows - 0.5).clamp(min=0)
-        i, j = x.long(), y.long()
-        corner, right = start + j * columns + i, (i + 1 < columns).long()
+        """Value (M, C) of samples that cover ``footprint`` metres (M,): bilinear, in the level
+        nearest to that; clamped at the charts' borders."""
+        level = (
+            torch.log2(footprint / self.spacing[chart])
+            .round()
+            .clamp(0, self.start.shape[1] - 1)
+            .long()
+        )
+        start = self.start[chart, level]
+        columns = self.columns[chart, level]
+        rows = self.rows[chart, level]
+        x = (u * columns - 0.5).clamp(min=0)
+        y = (v * rows - 0.5).clamp(min=0)
+        i = x.long()
+        j = y.long()
+        corner = start + j * columns + i
+        right = (i + 1 < columns).long()
         below = torch.where(j + 1 < rows, columns, 0)
         upper, lower = (
-            torch.lerp(self.data[at], self.data[at + right], (x - i)[:, None]) for at in (corner, corner + below)
+            torch.lerp(self.data[at], self.data[at + right], (x - i)[:, None])
+            for at in (corner, corner + below)
         )
         return torch.lerp(upper, lower, (y - j)[:, None])
 
@@ -84,7 +102,8 @@ class BakedRoom:
 
     Attributes:
         texture: colours, linear light, 3 channels.
-        light: irradiance / pi (3 channels; a white matte surface shows it) and the visible share of each light.
+        light: irradiance / pi (3 channels; a white matte surface shows it) and the visible share of
+            each light.
         gloss, shininess, emission: (charts,).
         exposure: factor on radiance before the tone curve, so that rooms come out equally bright.
     """
@@ -97,7 +116,9 @@ class BakedRoom:
     exposure: float
 
 
-def bake(solids: Solids, materials: tuple[Material, ...], lights: tuple[Light, ...], seed: int) -> BakedRoom:
+def bake(
+    solids: Solids, materials: tuple[Material, ...], lights: tuple[Light, ...], seed: int
+) -> BakedRoom:
     """Paint all charts and compute their light; a second or two."""
     with one_thread(), torch.no_grad():
         texture = _paint(solids, materials, seed)
@@ -108,14 +129,23 @@ def bake(solids: Solids, materials: tuple[Material, ...], lights: tuple[Light, .
         torch.tensor([getattr(material, name) for material in materials], **FLOATS)
         for name in ("gloss", "shininess", "emission")
     )
-    return BakedRoom(texture, light, gloss, shininess, emission, float(0.34 / (light.data[:shell, :3].mean() * albedo)))
+    return BakedRoom(
+        texture,
+        light,
+        gloss,
+        shininess,
+        emission,
+        float(0.34 / (light.data[:shell, :3].mean() * albedo)),
+    )
 
 
 def _paint(solids: Solids, materials: tuple[Material, ...], seed: int) -> ChartGrids:
-    images, spacing = [], []
+    images = []
+    spacing = []
     for chart, material in enumerate(materials):
         width, height = chart_size(solids, chart)
-        columns, rows = max(math.ceil(width / LIGHT.texel), 2), max(math.ceil(height / LIGHT.texel), 2)
+        columns = max(math.ceil(width / LIGHT.texel), 2)
+        rows = max(math.ceil(height / LIGHT.texel), 2)
         painted = material.paint(Canvas(width, height, columns, rows, seed * 1009 + chart))
         images.append(torch.from_numpy(painted).float().clamp(0, 1).permute(2, 0, 1))
         spacing.append(math.sqrt(width / columns * height / rows))
@@ -124,17 +154,21 @@ def _paint(solids: Solids, materials: tuple[Material, ...], seed: int) -> ChartG
 
 def _illuminate(solids: Solids, lights: tuple[Light, ...]) -> ChartGrids:
     """The light of all charts."""
-    shapes, placed = [], []
+    shapes = []
+    placed = []
     for chart in range(6 * len(solids)):
         width, height = chart_size(solids, chart)
-        rows, columns = max(round(height / LIGHT.lumel), 2), max(round(width / LIGHT.lumel), 2)
+        rows = max(round(height / LIGHT.lumel), 2)
+        columns = max(round(width / LIGHT.lumel), 2)
         v, u = ((torch.arange(count, **FLOATS) + 0.5) / count for count in (rows, columns))
         v, u = torch.meshgrid(v, u, indexing="ij")
         shapes.append((rows, columns))
         placed.append(chart_points(solids, chart, u.reshape(-1), v.reshape(-1)))
     points, normals = (torch.cat(parts, 1) for parts in zip(*placed, strict=True))
     points = points + normals * 2e-3  # off the surface
-    direct, visible = zip(*(_direct(solids, light, points, normals) for light in lights), strict=True)
+    direct, visible = zip(
+        *(_direct(solids, light, points, normals) for light in lights), strict=True
+    )
     total = torch.stack(direct).sum(0)
     shell = sum(rows * columns for rows, columns in shapes[:6])
     # Surfaces that reflect half of their light add as much again, in equal parts from everywhere.
@@ -146,9 +180,13 @@ def _illuminate(solids: Solids, lights: tuple[Light, ...]) -> ChartGrids:
 
 
 def _direct(solids: Solids, light: Light, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Irradiance / pi (M, 3) at points (3, M) from a light, and its visible share (M,), by 4 x 4 samples of it."""
-    center, edge_u, edge_v, color = map(torch.tensor, (light.center, light.edge_u, light.edge_v, light.color))
-    strength, visible = torch.zeros(points.shape[1], **FLOATS), torch.zeros(points.shape[1], **FLOATS)
+    """Irradiance / pi (M, 3) at points (3, M) from a light, and its visible share (M,), by 4 x 4
+    samples of it."""
+    center, edge_u, edge_v, color = map(
+        torch.tensor, (light.center, light.edge_u, light.edge_v, light.color)
+    )
+    strength = torch.zeros(points.shape[1], **FLOATS)
+    visible = torch.zeros(points.shape[1], **FLOATS)
     for a in (-0.75, -0.25, 0.25, 0.75):
         for b in (-0.75, -0.25, 0.25, 0.75):
             sample = center + a * edge_u + b * edge_v
@@ -156,7 +194,9 @@ def _direct(solids: Solids, light: Light, points: Tensor, normals: Tensor) -> tu
             squared = dot(offset, offset).clamp(min=0.02)
             way = offset / squared.sqrt()
             arriving = dot(way, normals).clamp(min=0) * -dot(way, light.normal).clamp(max=0)
-            for part in (arriving > 0).nonzero()[:, 0].split(1 << 15):  # temporaries stay in the cache
+            for part in (
+                (arriving > 0).nonzero()[:, 0].split(1 << 15)
+            ):  # temporaries stay in the cache
                 free = (~occluded(solids, points[:, part], sample)).float() / 16
                 visible[part] += free
                 strength[part] += arriving[part] * free / squared[part] / math.pi
@@ -164,13 +204,16 @@ def _direct(solids: Solids, light: Light, points: Tensor, normals: Tensor) -> tu
 
 
 def _openness(solids: Solids, points: Tensor, normals: Tensor) -> Tensor:
-    """Share (M,) of ambient light that arrives at points (3, M): all where the hemisphere is free for 1 m, 0.4 in gaps
-    and inside of solids."""
+    """Share (M,) of ambient light that arrives at points (3, M): all where the hemisphere is free
+    for 1 m, 0.4 in gaps and inside of solids."""
     count = 24
     steps = torch.arange(count, **FLOATS) + 0.5
-    angle, up = steps * (math.pi * (3 - math.sqrt(5))), 1 - 2 * steps / count
+    angle = steps * (math.pi * (3 - math.sqrt(5)))
+    up = 1 - 2 * steps / count
     radius = (1 - up * up).sqrt()
-    sphere = torch.stack([radius * angle.cos(), radius * angle.sin(), up])[:, None]  # evenly over a sphere
+    sphere = torch.stack([radius * angle.cos(), radius * angle.sin(), up])[
+        :, None
+    ]  # evenly over a sphere
     open_share = torch.empty(points.shape[1], **FLOATS)
     for part in torch.arange(points.shape[1], **INDICES).split((1 << 15) // count):
         # The normal plus a point of the unit sphere: distributed by the cosine.

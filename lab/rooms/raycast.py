@@ -1,7 +1,8 @@
 """Rays against axis-aligned boxes and ellipsoids, in plain torch.
 
-Solid 0 is the room itself, a box seen from inside. Every solid has six charts, the faces of its bounding box in the
-order -x, +x, -y, +y, -z, +z; an ellipsoid takes its texture from the box around it. Vectors are (3, M).
+Solid 0 is the room itself, a box seen from inside. Every solid has six charts, the faces of its
+bounding box in the order -x, +x, -y, +y, -z, +z; an ellipsoid takes its texture from the box around
+it. Vectors are (3, M).
 """
 
 from dataclasses import dataclass
@@ -42,16 +43,19 @@ class Solids:
         return len(self.center)
 
     def interval(self, number: int, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Where lines from ``origins`` (3, M) or (3, 1), world, along ``directions`` (3, M) enter and leave a solid.
+        """Where lines from ``origins`` (3, M) or (3, 1), world, along ``directions`` (3, M) enter
+        and leave a solid.
 
-        Returns (near, far), each (M,), in multiples of the direction; near >= far where the line misses. Formulas:
-        slabs (Kay and Kajiya 1986) and the quadratic of the unit ball.
+        Returns (near, far), each (M,), in multiples of the direction; near >= far where the line
+        misses. Formulas: slabs (Kay and Kajiya 1986) and the quadratic of the unit ball.
         """
         half = self.half[number, :, None]
-        origins, directions = (origins - self.center[number, :, None]) / half, directions / half
+        origins = (origins - self.center[number, :, None]) / half
+        directions = directions / half
         if not self.round[number]:
             inverse = (directions + 1e-12).reciprocal()  # a ray exactly along a face leans a little
-            middle, reach = -origins * inverse, inverse.abs()
+            middle = -origins * inverse
+            reach = inverse.abs()
             return (middle - reach).amax(0), (middle + reach).amin(0)
         square = dot(directions, directions)
         middle = -dot(origins, directions) / square
@@ -63,11 +67,13 @@ class Solids:
 
 
 def trace(solids: Solids, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """First hit of rays from ``origins`` (3, M), or (3, 1) for a camera's, inside the room along ``directions`` (3, M):
-    its distance in multiples of the direction and the solid, each (M,)."""
+    """First hit of rays from ``origins`` (3, M), or (3, 1) for a camera's, inside the room along
+    ``directions`` (3, M): its distance in multiples of the direction and the solid, each (M,)."""
     _, best = solids.interval(0, origins, directions)
     index = torch.zeros(len(best), **INDICES)
-    for number in _in_cone(solids, origins, directions) if origins.shape[1] == 1 else range(1, len(solids)):
+    for number in (
+        _in_cone(solids, origins, directions) if origins.shape[1] == 1 else range(1, len(solids))
+    ):
         near, far = solids.interval(number, origins, directions)
         hit = (near < far) & (near > 1e-4) & (near < best)
         best = torch.where(hit, near, best)
@@ -76,15 +82,19 @@ def trace(solids: Solids, origins: Tensor, directions: Tensor) -> tuple[Tensor, 
 
 
 def _in_cone(solids: Solids, origin: Tensor, directions: Tensor) -> list[int]:
-    """Numbers of the solids, but the room, whose bounding spheres meet the cone around all rays from one point."""
+    """Numbers of the solids, but the room, whose bounding spheres meet the cone around all rays
+    from one point."""
     rays = unit(directions)
     axis = unit(rays.sum(1))
     opening = torch.acos((axis @ rays).min().clamp(-1, 1))
     offset = solids.center.T - origin
-    distance, radius = offset.norm(dim=0), solids.half.norm(dim=1)
+    distance = offset.norm(dim=0)
+    radius = solids.half.norm(dim=1)
     between = torch.acos((axis @ unit(offset)).clamp(-1, 1))
     meets = between <= opening + torch.asin((radius / distance).clamp(max=1)) + 1e-3
-    return [number for number in (meets | (distance <= radius)).nonzero()[:, 0].tolist() if number > 0]
+    return [
+        number for number in (meets | (distance <= radius)).nonzero()[:, 0].tolist() if number > 0
+    ]
 
 
 def occluded(solids: Solids, origins: Tensor, target: Tensor) -> Tensor:
@@ -99,7 +109,8 @@ def occluded(solids: Solids, origins: Tensor, target: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Hits:
-    """Hits of rays on surfaces: chart (M,), which is 6 x solid + face, u and v (M,) in [0, 1], normal (3, M)."""
+    """Hits of rays on surfaces: chart (M,), which is 6 x solid + face, u and v (M,) in [0, 1],
+    normal (3, M)."""
 
     chart: Tensor
     u: Tensor
@@ -130,13 +141,20 @@ def surface(solids: Solids, points: Tensor, index: Tensor) -> Hits:
 
 
 def chart_points(solids: Solids, chart: int, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """World points and normals, (3, M) each, of texture coordinates (M,): the inverse of :func:`surface`."""
-    number, (axis, positive) = chart // 6, divmod(chart % 6, 2)
+    """World points and normals, (3, M) each, of texture coordinates (M,): the inverse of
+    :func:`surface`."""
+    number = chart // 6
+    (axis, positive) = divmod(chart % 6, 2)
     sign = 2.0 * positive - 1
     facing = -sign if number == 0 else sign
-    fixed, right, down = torch.full_like(u, sign), 2 * u - 1, 2 * v - 1
-    rows = ([fixed, right * facing, -down], [-right * facing, fixed, -down], [right, -down, fixed])[axis]
-    spot, half = torch.stack(rows), solids.half[number, :, None]
+    fixed = torch.full_like(u, sign)
+    right = 2 * u - 1
+    down = 2 * v - 1
+    rows = ([fixed, right * facing, -down], [-right * facing, fixed, -down], [right, -down, fixed])[
+        axis
+    ]
+    spot = torch.stack(rows)
+    half = solids.half[number, :, None]
     normal = torch.zeros_like(spot)
     normal[axis] = facing
     if solids.round[number]:

@@ -40,8 +40,8 @@ class Room:
 
 
 def make_room(seed: int) -> Room:
-    """The room of a seed, 0 or more: its size, furniture, materials and lights. Raises DataError if the seed is
-    negative.
+    """The room of a seed, 0 or more: its size, furniture, materials and lights. Raises DataError if
+    the seed is negative.
 
     Example:
         >>> [round(metres, 1) for metres in make_room(3).size]
@@ -49,15 +49,23 @@ def make_room(seed: int) -> Room:
     """
     if seed < 0:
         raise DataError(f"room seed {seed}: expected 0 or more")
-    rng, builder = np.random.default_rng([seed, 20]), Builder()
+    rng = np.random.default_rng([seed, 20])
+    builder = Builder()
     width, depth, height = rng.uniform((3.8, 3.4, 2.4), (6.0, 5.0, 2.9)).tolist()
     _furnish(builder, Palette(rng), _Plan((width, depth, height), rng))
-    return Room(seed, (width, depth, height), builder.solids(), tuple(builder.materials), tuple(builder.lights))
+    return Room(
+        seed,
+        (width, depth, height),
+        builder.solids(),
+        tuple(builder.materials),
+        tuple(builder.lights),
+    )
 
 
 @dataclass
 class _Plan:
-    """The walls of a room of a width, depth and height in metres, and what is taken of its space."""
+    """The walls of a room of a width, depth and height in metres, and what is taken of its
+    space."""
 
     size: Vec
     rng: np.random.Generator
@@ -70,9 +78,13 @@ class _Plan:
         return LocalFrame(x * self.size[0], y * self.size[1], number), self.size[number % 2]
 
     def take(self, at: LocalFrame, size: Vec, low: float = 0.0) -> bool:
-        """Take a box of a size that stands at a frame's origin, its foot at a height; False if it is not free."""
-        ends = np.array([at.point((x, y, low)) for x in (-size[0] / 2, size[0] / 2) for y in (0.02, size[1])])
-        lower, upper = ends.min(0), ends.max(0) + (0, 0, size[2])
+        """Take a box of a size that stands at a frame's origin, its foot at a height; False if it
+        is not free."""
+        ends = np.array(
+            [at.point((x, y, low)) for x in (-size[0] / 2, size[0] / 2) for y in (0.02, size[1])]
+        )
+        lower = ends.min(0)
+        upper = ends.max(0) + (0, 0, size[2])
         if any((lower < b + 0.05).all() and (a < upper + 0.05).all() for a, b in self.taken):
             return False
         self.taken.append((lower, upper))
@@ -90,18 +102,25 @@ class _Plan:
 
 def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
     """Build the shell of a room, windows, a door, furniture, pictures and a lamp."""
-    rng, height, middle = plan.rng, plan.size[2], LocalFrame(0, 0, 0)
+    rng = plan.rng
+    height = plan.size[2]
+    middle = LocalFrame(0, 0, 0)
     b.box(middle, (0, 0, height / 2), plan.size, Material(tex.plain(pal.wall, 0.07, 0.4)))
     darker = (0.78 * pal.wall[0], 0.78 * pal.wall[1], 0.78 * pal.wall[2])
-    b.materials[int(rng.integers(4))] = Material(tex.stripes([pal.wall, darker], float(rng.uniform(0.08, 0.16))))
+    b.materials[int(rng.integers(4))] = Material(
+        tex.stripes([pal.wall, darker], float(rng.uniform(0.08, 0.16)))
+    )
     floor = Material(tex.wood(pal.timber, board=0.15), gloss=0.12, shininess=60.0)
     b.materials[4:6] = [floor, Material(tex.plain((0.8, 0.79, 0.76), 0.05, 0.6))]
     for at, length in map(plan.wall, range(4)):
         b.box(at, (0, 0.008, 0.05), (length - 0.02, 0.016, 0.1), pal.white)  # skirting
-    glow, rim = Material(tex.plain((1.0, 0.92, 0.78), 0.02), emission=1.6), Material(tex.plain((0.25, 0.24, 0.22)))
+    glow = Material(tex.plain((1.0, 0.92, 0.78), 0.02), emission=1.6)
+    rim = Material(tex.plain((0.25, 0.24, 0.22)))
     b.box(middle, (0, 0, height - 0.03), (0.5, 0.5, 0.06), rim, opaque=False)
     b.box(middle, (0, 0, height - 0.07), (0.44, 0.44, 0.04), glow, opaque=False)
-    b.lights.append(Light((0, 0, height - 0.1), (0.2, 0, 0), (0, 0.2, 0), (0, 0, -1), (2.0, 1.75, 1.35)))
+    b.lights.append(
+        Light((0, 0, height - 0.1), (0.2, 0, 0), (0, 0.2, 0), (0, 0, -1), (2.0, 1.75, 1.35))
+    )
 
     for _ in range(1 + int(rng.integers(2))):
         w = float(rng.uniform(1.1, 1.8))
@@ -114,7 +133,9 @@ def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
     # Width, depth and height of a piece, and the height to leave free above it, metres.
     pieces: list[tuple[Callable[[Builder, LocalFrame, Palette, Vec], None], Vec, float]] = [
         (fur.sofa, (1.9, 0.88, 0.8), 0.0),
-        (fur.television, (1.4, 0.4, 0.45), 0.7) if rng.random() < 0.5 else (fur.wardrobe, (1.1, 0.55, 2.0), 0.0),
+        (fur.television, (1.4, 0.4, 0.45), 0.7)
+        if rng.random() < 0.5
+        else (fur.wardrobe, (1.1, 0.55, 2.0), 0.0),
         (fur.dresser, (1.0, 0.45, 0.8), 0.2),
         (fur.bookshelf, (1.0, 0.3, 1.9), 0.0),
         (fur.plant, (0.6, 0.6, 1.5), 0.0),
@@ -125,7 +146,9 @@ def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
         if spot := plan.spot((w, d, h + above)):
             build(b, spot.moved(0, 0.025), pal, (w, d, h))
     for _ in range(8):
-        w, h, low = (float(rng.uniform(*bounds)) for bounds in ((0.45, 0.95), (0.4, 0.75), (1.05, 1.4)))
+        w, h, low = (
+            float(rng.uniform(*bounds)) for bounds in ((0.45, 0.95), (0.4, 0.75), (1.05, 1.4))
+        )
         if spot := plan.spot((w, 0.05, h), low, tries=4):
             art = Material(tex.picture([*pal.accents, pal.pale]), gloss=0.08)
             b.box(spot, (0, 0.015, low + h / 2), (w, 0.03, h), pal.wood, front=art)
@@ -133,22 +156,30 @@ def _furnish(b: Builder, pal: Palette, plan: _Plan) -> None:
 
 def _window(b: Builder, at: LocalFrame, pal: Palette, width: float) -> None:
     """A window of a width, 1.25 m high, with a sill and curtains."""
-    height, z = 1.25, 0.95 + 1.25 / 2
-    panes = Material(tex.window(hsv(0.57, 0.45, 0.9), hsv(0.28, 0.45, 0.55), 2 if width < 1.5 else 3), emission=1.7)
+    height = 1.25
+    z = 0.95 + 1.25 / 2
+    panes = Material(
+        tex.window(hsv(0.57, 0.45, 0.9), hsv(0.28, 0.45, 0.55), 2 if width < 1.5 else 3),
+        emission=1.7,
+    )
     b.box(at, (0, 0.01, z), (width, 0.02, height), pal.white, front=panes, opaque=False)
     b.box(at, (0, 0.08, 0.93), (width + 0.2, 0.16, 0.04), pal.white)
     curtain = Material(tex.stripes([pal.accent(), pal.pale], 0.09))
     for side in (-1, 1):
         b.box(at, (side * (width / 2 + 0.16), 0.09, z - 0.02), (0.3, 0.06, height + 0.2), curtain)
     b.box(at, (0, 0.1, z + height / 2 + 0.1), (width + 0.7, 0.03, 0.03), pal.metal)
-    edge, area = at.vector((width / 2, 0, 0)), width * height
+    edge = at.vector((width / 2, 0, 0))
+    area = width * height
     color = (1.5 * area, 1.62 * area, 1.8 * area)
-    b.lights.append(Light(at.point((0, 0.03, z)), edge, (0, 0, height / 2), at.vector((0, 1, 0)), color))
+    b.lights.append(
+        Light(at.point((0, 0.03, z)), edge, (0, 0, height / 2), at.vector((0, 1, 0)), color)
+    )
 
 
 def _middle(b: Builder, pal: Palette, plan: _Plan) -> None:
     """The rug, and on it a table with chairs, a low table or nothing."""
-    rng, (width, depth, _) = plan.rng, plan.size
+    rng = plan.rng
+    (width, depth, _) = plan.size
     at = LocalFrame(float(rng.uniform(-0.25, 0.25)), float(rng.uniform(-0.2, 0.2)), 0)
     rug = (float(rng.uniform(0.35, 0.45)) * width, float(rng.uniform(0.35, 0.45)) * depth, 0.012)
     b.box(at, (0, 0, 0.006), rug, Material(tex.rug([pal.accent(), pal.pale, pal.accents[3]])))

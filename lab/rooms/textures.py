@@ -1,6 +1,7 @@
 """Procedural colours of surfaces, as functions of metres on a surface.
 
-Nothing in them is finer than about 1.5 cm, so that pictures of ordinary size resolve it and show no moire.
+Nothing in them is finer than about 1.5 cm, so that pictures of ordinary size resolve it and show no
+moire.
 """
 
 from collections.abc import Callable
@@ -12,23 +13,31 @@ Color = tuple[float, float, float]
 
 
 class Canvas:
-    """A surface to paint on: x and y (H, W) in metres from its top left, its size, and a generator."""
+    """A surface to paint on: x and y (H, W) in metres from its top left, its size, and a
+    generator."""
 
     def __init__(self, width: float, height: float, columns: int, rows: int, seed: int):
-        self.width, self.height = width, height
+        self.width = width
+        self.height = height
         self.rng = np.random.default_rng(seed)
         x = (np.arange(columns, dtype=np.float32) + 0.5) * (width / columns)
         y = (np.arange(rows, dtype=np.float32) + 0.5) * (height / rows)
         self.x, self.y = np.meshgrid(x, y)
-        self.edge = np.minimum(np.minimum(self.x, width - self.x), np.minimum(self.y, height - self.y))
+        self.edge = np.minimum(
+            np.minimum(self.x, width - self.x), np.minimum(self.y, height - self.y)
+        )
         """Distance to the nearest edge, metres."""
 
     def noise(self, scale: float, stretch: float = 1.0) -> np.ndarray:
-        """Smooth value noise in [0, 1], lattice spacing ``scale`` metres in y and ``scale * stretch`` in x."""
-        gx, gy = self.x / (scale * stretch), self.y / scale
+        """Smooth value noise in [0, 1], lattice spacing ``scale`` metres in y and ``scale *
+        stretch`` in x."""
+        gx = self.x / (scale * stretch)
+        gy = self.y / scale
         lattice = self.rng.random((int(gy.max()) + 2, int(gx.max()) + 2), dtype=np.float32)
-        i, j = gx.astype(int), gy.astype(int)
-        fx, fy = _smooth(gx - i), _smooth(gy - j)
+        i = gx.astype(int)
+        j = gy.astype(int)
+        fx = _smooth(gx - i)
+        fy = _smooth(gy - j)
         top = lattice[j, i] * (1 - fx) + lattice[j, i + 1] * fx
         bottom = lattice[j + 1, i] * (1 - fx) + lattice[j + 1, i + 1] * fx
         return top * (1 - fy) + bottom * fy
@@ -73,7 +82,8 @@ def plain(color: Color, grain: float = 0.08, scale: float = 0.25) -> Painter:
 
 
 def wood(color: Color, board: float = 0.0) -> Painter:
-    """Wood with its grain along the longer side; ``board`` is the width of planks in metres, 0 for one piece."""
+    """Wood with its grain along the longer side; ``board`` is the width of planks in metres, 0 for
+    one piece."""
 
     def paint(c: Canvas) -> np.ndarray:
         if c.height > c.width:
@@ -84,7 +94,9 @@ def wood(color: Color, board: float = 0.0) -> Painter:
             row, edge = _cells(c.y, board)
             column, end = _cells(c.x + 1.2 * c.rng.random(row.max() + 1)[row], 1.2)
             tone = c.rng.random((row.max() + 1, column.max() + 1))[row, column]
-            shade = shade * (0.76 + 0.40 * tone) * (0.45 + 0.55 * _step(np.minimum(edge, end) - 0.006))
+            shade = (
+                shade * (0.76 + 0.40 * tone) * (0.45 + 0.55 * _step(np.minimum(edge, end) - 0.006))
+            )
         return c.fill(color) * shade[..., None]
 
     return paint
@@ -95,7 +107,10 @@ def stripes(colors: list[Color], width: float, horizontal: bool = False) -> Pain
 
     def paint(c: Canvas) -> np.ndarray:
         index, _ = _cells(c.y if horizontal else c.x, width)
-        return np.asarray(colors, np.float32)[index % len(colors)] * (0.9 + 0.16 * c.clouds(0.2))[..., None]
+        return (
+            np.asarray(colors, np.float32)[index % len(colors)]
+            * (0.9 + 0.16 * c.clouds(0.2))[..., None]
+        )
 
     return paint
 
@@ -133,10 +148,16 @@ def picture(colors: list[Color]) -> Painter:
     def paint(c: Canvas) -> np.ndarray:
         out = _mix(c.fill(colors[0]), colors[1], c.y / c.height)
         for _ in range(9):
-            x, y, size = c.rng.random() * c.width, c.rng.random() * c.height, c.rng.uniform(0.08, 0.3)
+            x = c.rng.random() * c.width
+            y = c.rng.random() * c.height
+            size = c.rng.uniform(0.08, 0.3)
             inside = size * min(c.width, c.height) - np.hypot(c.x - x, c.y - y)
             out = _mix(out, colors[c.rng.integers(len(colors))], 0.9 * _step(inside, 0.01))
-        out = _mix(out * (0.9 + 0.2 * c.clouds(0.05, 2))[..., None], (0.88, 0.86, 0.8), _step(0.065 - c.edge))
+        out = _mix(
+            out * (0.9 + 0.2 * c.clouds(0.05, 2))[..., None],
+            (0.88, 0.86, 0.8),
+            _step(0.065 - c.edge),
+        )
         return _mix(out, (0.12, 0.1, 0.08), _step(0.035 - c.edge))
 
     return paint
@@ -147,7 +168,9 @@ def window(sky: Color, ground: Color, panes: int) -> Painter:
 
     def paint(c: Canvas) -> np.ndarray:
         out = _mix(c.fill(sky), (0.9, 0.93, 0.96), np.clip(1.3 * c.y / c.height, 0, 1))
-        out = _mix(out, (1.0, 1.0, 1.0), 0.7 * _smooth(np.clip(2.4 * c.clouds(0.3, 3, 2.0) - 1.0, 0, 1)))
+        out = _mix(
+            out, (1.0, 1.0, 1.0), 0.7 * _smooth(np.clip(2.4 * c.clouds(0.3, 3, 2.0) - 1.0, 0, 1))
+        )
         hills = c.height * (0.66 + 0.05 * np.sin(c.x * 4 + c.rng.uniform(0, 6)))
         out = _mix(out, ground, _step(c.y - hills, 0.02))
         for along, spacing in ((c.x, c.width / panes), (c.y, c.height / 2)):

@@ -20,7 +20,8 @@ from pointsplat_ns.system.progress import Progress, tracked
 
 
 def is_written(folder: Path, frames: int, width: int, height: int) -> bool:
-    """Whether a folder holds a room of such photos. As rooms get their names when they are complete, it then is."""
+    """Whether a folder holds a room of such photos. As rooms get their names when they are
+    complete, it then is."""
     try:
         camera = json.loads(read_text(folder / "cam_params.json"))["camera"]
         poses = read_text(folder / "traj.txt").splitlines()
@@ -46,14 +47,15 @@ def write_room(
         frames: number of photos, at least 2.
         width: width of a photo, pixels, at least 8.
         height: height of a photo, pixels, at least 8.
-        progress: True shows a bar; a function is called with the name of the task and the share of it that is done.
+        progress: True shows a bar; a function is called with the name of the task and the share of
+            it that is done.
 
     Returns:
         ``folder``.
 
     Raises:
-        DataError: if ``folder`` exists and is not an empty folder or cannot be written, or there are too few frames or
-            pixels.
+        DataError: if ``folder`` exists and is not an empty folder or cannot be written, or there
+            are too few frames or pixels.
 
     Example:
         >>> import tempfile
@@ -66,11 +68,16 @@ def write_room(
 
     folder = Path(folder)
     if frames < 2 or width < 8 or height < 8:
-        raise DataError(f"room of {frames} frames, {width} x {height}: expected at least 2 frames of 8 x 8 pixels")
+        raise DataError(
+            f"room of {frames} frames, {width} x {height}: expected at least 2 frames of 8 x 8 "
+            "pixels"
+        )
     partial = folder.with_name(f".{folder.name[:50]}.partial-{os.getpid()}")
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise DataError(f"{folder}: exists and is not an empty folder; remove it or name another")
+            raise DataError(
+                f"{folder}: exists and is not an empty folder; remove it or name another"
+            )
         (partial / "results").mkdir(parents=True)
         room = make_room(seed)
         poses = capture_path(room, frames, seed)
@@ -81,8 +88,12 @@ def write_room(
             pixels = (rgb * 255).round().to(torch.uint8).numpy()
             raw = (depth * counts).round().clamp(0, 65534).numpy().astype(np.uint16)
             # Without chroma subsampling: coloured edges stay sharp.
-            Image.fromarray(pixels).save(partial / "results" / f"frame{number:06d}.jpg", quality=97, subsampling=0)
-            Image.fromarray(raw).save(partial / "results" / f"depth{number:06d}.png", compress_level=1)
+            Image.fromarray(pixels).save(
+                partial / "results" / f"frame{number:06d}.jpg", quality=97, subsampling=0
+            )
+            Image.fromarray(raw).save(
+                partial / "results" / f"depth{number:06d}.png", compress_level=1
+            )
         lines = [" ".join(f"{v:.9g}" for v in pose.double().reshape(-1).tolist()) for pose in poses]
         (partial / "traj.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
         # Replica's files count from the first pixel's centre, hence the half pixel less.
@@ -95,7 +106,9 @@ def write_room(
             "cy": height / 2 - 0.5,
             "scale": counts,
         }
-        (partial / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8")
+        (partial / "cam_params.json").write_text(
+            json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8"
+        )
         os.replace(partial, folder)
     except OSError as error:
         raise DataError(f"{folder}: cannot be written ({error.strerror or error})") from error
@@ -105,12 +118,12 @@ def write_room(
 
 
 def capture_path(room: Room, frames: int, seed: int) -> Tensor:
-    """Camera poses (F, 4, 4) on a walk of two rounds through a room: the first looks across it, the second to both
-    sides. float32, camera-to-world, OpenCV axes, z of the world up, metres.
+    """Camera poses (F, 4, 4) on a walk of two rounds through a room: the first looks across it, the
+    second to both sides. float32, camera-to-world, OpenCV axes, z of the world up, metres.
 
-    Height and pitch vary on the way; the seed decides where the walk starts, which way it goes, and how they vary.
-    Positions keep at least 0.3 m from all surfaces: 1.05 m from walls, which is more than furniture as high as the
-    camera is deep, and above all that stands in the middle.
+    Height and pitch vary on the way; the seed decides where the walk starts, which way it goes, and
+    how they vary. Positions keep at least 0.3 m from all surfaces: 1.05 m from walls, which is more
+    than furniture as high as the camera is deep, and above all that stands in the middle.
 
     Example:
         >>> from lab.rooms import make_room

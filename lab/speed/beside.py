@@ -1,11 +1,13 @@
-"""Whole `prune` commands beside splat-transform's: CPU seconds and memory at several budgets, and their ratios.
+"""Whole `prune` commands beside splat-transform's: CPU seconds and memory at several budgets, and
+their ratios.
 
-    OMP_NUM_THREADS=1 python -m lab.speed.beside scenes/rock.ply --splat-transform node_modules/.bin/splat-transform \\
+    OMP_NUM_THREADS=1 python -m lab.speed.beside scenes/rock.ply --splat-transform
+    node_modules/.bin/splat-transform \\
         --json docs/record/speed.json --resume
     python -m lab.speed.beside --write docs/record/speed.json
 
-The second writes ``docs/record/speed.md``. Each process counts with its start, reading and writing. Both programs take
-turns, so that a busy machine slows both alike.
+The second writes ``docs/record/speed.md``. Each process counts with its start, reading and writing.
+Both programs take turns, so that a busy machine slows both alike.
 """
 
 from __future__ import annotations
@@ -52,7 +54,9 @@ def page(rows: list[Row]) -> str:
     scenes = grouped(rows, lambda row: (row["scene"], row["gaussians"], row["sh_degree"]))
     for (scene, count, degree), same in sorted(scenes.items(), key=lambda item: -item[0][1]):
         pairs = {keep: [row for row in same if row["keep"] == keep] for keep in keeps}
-        memory = "/".join(f"{row['peak_bytes'] / 1e6:,.0f}" for row in pairs[min(row["keep"] for row in same)])
+        memory = "/".join(
+            f"{row['peak_bytes'] / 1e6:,.0f}" for row in pairs[min(row["keep"] for row in same)]
+        )
         lines.append([f"{scene}, {count:,}, SH {degree}", *map(_cell, pairs.values()), memory])
     heads = ("scene, Gaussians", *(f"{keep:.0%}" for keep in keeps), "MB")
     return f"{PAGE}\n{markdown(heads, lines)}\n"
@@ -62,7 +66,10 @@ def _cell(pair: list[Row]) -> str:
     """CPU seconds of both and their ratio; empty if they were not measured."""
     if not pair:
         return ""
-    ours, theirs = (next(row["cpu_seconds"] for row in pair if (row["method"] == OURS) is own) for own in (True, False))
+    ours, theirs = (
+        next(row["cpu_seconds"] for row in pair if (row["method"] == OURS) is own)
+        for own in (True, False)
+    )
     return f"{ours:.1f}/{theirs:.1f}={ours / theirs:.2f}"
 
 

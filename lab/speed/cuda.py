@@ -1,10 +1,12 @@
-"""Whether everything works on a GPU as on the CPU, and how fast the rasterizer is there beside gsplat.
+"""Whether everything works on a GPU as on the CPU, and how fast the rasterizer is there beside
+gsplat.
 
     python -m lab.speed.cuda
 
-Checks say pass or fail, and the status is 0 if all pass. They need no other data than what ships: golden pictures,
-the room, and photos of a room that are made. It takes at most four minutes, and gsplat, if it is installed, as long as
-its kernels take to compile when first used, which is why it comes last.
+Checks say pass or fail, and the status is 0 if all pass. They need no other data than what ships:
+golden pictures, the room, and photos of a room that are made. It takes at most four minutes, and
+gsplat, if it is installed, as long as its kernels take to compile when first used, which is why it
+comes last.
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ NEAR_DB = 0.1
 """Largest difference of PSNR between two devices, dB: a repair rounds in another way on each."""
 
 NEAR_GSPLAT = 4e-3, 2e-3
-"""Largest difference from gsplat, of colours in [0, 1] and of a gradient's norm: gsplat counts alpha up to 0.999 and
-clamps the Jacobian elsewhere."""
+"""Largest difference from gsplat, of colours in [0, 1] and of a gradient's norm: gsplat counts
+alpha up to 0.999 and clamps the Jacobian elsewhere."""
 
 Check = Callable[[], str]
 """A check gives what it found in words, or raises: AssertionError with what is wrong."""
@@ -52,28 +54,36 @@ Check = Callable[[], str]
 
 def scenes_of(every: int) -> dict[str, ps.Gaussians]:
     """The two scenes, every so many-th Gaussian of each."""
-    return {"the room that ships": ps.example_room()[::every], "bare walls": scenes.room(20_000 // every)}
+    return {
+        "the room that ships": ps.example_room()[::every],
+        "bare walls": scenes.room(20_000 // every),
+    }
 
 
 def golden_pictures(device: torch.device) -> str:
-    """Pictures and gradients of small scenes are those of the float64 reference, in both precisions."""
+    """Pictures and gradients of small scenes are those of the float64 reference, in both
+    precisions."""
     sys.path.insert(0, str(SUPPORT))
     import golden
 
     for name in golden.SCENES:
         for dtype, tolerances in golden.TOLERANCES.items():
             try:
-                golden.compare(golden.drawn(name, dtype, device), golden.drawn_by_reference(name), *tolerances)
+                golden.compare(
+                    golden.drawn(name, dtype, device), golden.drawn_by_reference(name), *tolerances
+                )
             except AssertionError as error:
                 raise AssertionError(f"{name}, {dtype}: {error}") from None
     return f"{len(golden.SCENES)} scenes in {len(golden.TOLERANCES)} precisions"
 
 
 def pruned(scene: ps.Gaussians, device: torch.device) -> str:
-    """Merging keeps as many Gaussians as on the CPU, and as good; and its time, after a part that warms up."""
+    """Merging keeps as many Gaussians as on the CPU, and as good; and its time, after a part that
+    warms up."""
     views = ps.sample_views(scene, 4)
     dense = ps.render(scene, views)
-    found, seconds = [], []
+    found = []
+    seconds = []
     for each in (torch.device("cpu"), device):
         there = scene.to(each)
         ps.prune(there[::9], 0.1)
@@ -89,7 +99,9 @@ def compacted(scene: ps.Gaussians, device: torch.device, resolution: tuple[int, 
     """The same of a compact scene. What draws is the default device, which is changed."""
     found = []
     for each in (torch.device("cpu"), device):
-        with mock.patch("pointsplat_ns.compression.requests.default_device", lambda each=each: each):
+        with mock.patch(
+            "pointsplat_ns.compression.requests.default_device", lambda each=each: each
+        ):
             result = ps.compact(scene, 0.1, resolution=resolution)
         found.append((len(result.scene), result.stages[-1].after.psnr))
     return compared(found)
@@ -114,14 +126,19 @@ class Trainings:
     """
 
     def __init__(self, folder: Path, device: torch.device, steps: int, every: int):
-        self.folder, self.device, self.steps, self.every = folder, device, steps, every
+        self.folder = folder
+        self.device = device
+        self.steps = steps
+        self.every = every
 
     def of_a_scene(self) -> str:
         """splatfacto-cpu, of photos of a room that are made."""
         from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
         from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
 
-        photos = write_room(self.folder / "photos" / "room0", seed=0, frames=12, width=160, height=120)
+        photos = write_room(
+            self.folder / "photos" / "room0", seed=0, frames=12, width=160, height=120
+        )
 
         def config() -> Any:
             made = splatfacto_cpu_config()
@@ -142,13 +159,16 @@ class Trainings:
             made.pipeline.datamanager.data = made.data = self.folder / "runs"
             made.pipeline.datamanager.sampled_poses = 10
             made.pipeline.datamanager.sampled_size = (160, 120)
-            made.pipeline.model.size, made.pipeline.model.lpips_weight = "tiny", 0.0  # whose weights may be missing
+            # whose weights may be missing
+            made.pipeline.model.size = "tiny"
+            made.pipeline.model.lpips_weight = 0.0
             return made
 
         return self._resumed(config, "refiner")
 
     def _resumed(self, config: Callable[[], Any], name: str) -> str:
-        """Train half of the steps, resume from the checkpoint for the others, and compare with one training of all."""
+        """Train half of the steps, resume from the checkpoint for the others, and compare with one
+        training of all."""
         half = self.steps // 2
         first, losses = self._trained(config(), f"{name} half", half)
         rest, others = self._trained(config(), name, self.steps - half, first.checkpoint_dir)
@@ -157,22 +177,30 @@ class Trainings:
         losses += others
         assert len(losses) == self.steps and all(map(math.isfinite, losses)), f"losses are {losses}"
         few = max(1, self.steps // 5)
-        before, after = sum(losses[:few]) / few, sum(losses[-few:]) / few
+        before = sum(losses[:few]) / few
+        after = sum(losses[-few:]) / few
         return f"{len(losses)} steps, loss {before:.4f} to {after:.4f}"
 
-    def _trained(self, config: Any, name: str, steps: int, load: Path | None = None) -> tuple[Any, list[float]]:
-        """The trainer after some steps, and their losses. Runs that are whole are in ``runs``, and others not."""
+    def _trained(
+        self, config: Any, name: str, steps: int, load: Path | None = None
+    ) -> tuple[Any, list[float]]:
+        """The trainer after some steps, and their losses. Runs that are whole are in ``runs``, and
+        others not."""
         from nerfstudio.utils import writer
 
         config.output_dir = self.folder / ("halves" if load is None else "runs")
-        config.experiment_name, config.max_num_iterations, config.load_dir = name, steps, load
-        config.machine.device_type, config.vis = self.device.type, "tensorboard"
+        config.experiment_name = name
+        config.max_num_iterations = steps
+        config.load_dir = load
+        config.machine.device_type = self.device.type
+        config.vis = "tensorboard"
         config.pipeline.model.backend = "torch"  # gsplat's kernels may have to be compiled
         config.steps_per_eval_image = config.steps_per_eval_all_images = 0
         config.set_timestamp()
         config.save_config()
         torch.manual_seed(0)
-        trainer, losses = config.setup(local_rank=0, world_size=1), []
+        trainer = config.setup(local_rank=0, world_size=1)
+        losses = []
         trainer.setup()
         step_of = trainer.train_iteration
 
@@ -192,32 +220,42 @@ class Trainings:
         return trainer, losses
 
 
-def drawn(scene: ps.Gaussians, view: ps.View, factor: float, backend: str, grads: bool) -> tuple[Tensor, list[Tensor]]:
-    """An image (1, H, W, 3) and the gradients of its mean square, if wanted, for means, quats, scales, opacities and
-    SH."""
+def drawn(
+    scene: ps.Gaussians, view: ps.View, factor: float, backend: str, grads: bool
+) -> tuple[Tensor, list[Tensor]]:
+    """An image (1, H, W, 3) and the gradients of its mean square, if wanted, for means, quats,
+    scales, opacities and SH."""
     leaves = [
         t.detach().clone().requires_grad_(grads)
         for t in (scene.means, scene.quats, scene.stds, scene.alphas, scene.sh)
-    ]  # fmt: skip
+    ]
     K = view.K.clone()
     K[:2] *= factor
     image, _, _ = rasterization(
-        *leaves, viewmats=view.viewmat[None], Ks=K[None], width=round(view.width * factor),
-        height=round(view.height * factor), sh_degree=scene.sh_degree, backend=backend,
-    )  # fmt: skip
+        *leaves,
+        viewmats=view.viewmat[None],
+        Ks=K[None],
+        width=round(view.width * factor),
+        height=round(view.height * factor),
+        sh_degree=scene.sh_degree,
+        backend=backend,
+    )
     return image.detach(), [*torch.autograd.grad(image.square().mean(), leaves)] if grads else []
 
 
 def times(scene: ps.Gaussians, device: torch.device, backend: str, rounds: int = 3) -> str:
-    """Milliseconds of pictures of 320 and 640 pixels: medians over views and rounds, after a round that warms up."""
-    views, scene = ps.sample_views(scene, 4), scene.to(device)
+    """Milliseconds of pictures of 320 and 640 pixels: medians over views and rounds, after a round
+    that warms up."""
+    views = ps.sample_views(scene, 4)
+    scene = scene.to(device)
     found = []
     for factor in (1.0, 2.0):
         for grads in (False, True):
             call = partial(drawn, scene, factor=factor, backend=backend, grads=grads)
             milliseconds = [
-                [1e3 * seconds_of(partial(call, view=view)) for view in views] for _ in range(rounds + 1)
-            ]  # fmt: skip
+                [1e3 * seconds_of(partial(call, view=view)) for view in views]
+                for _ in range(rounds + 1)
+            ]
             what = f"{round(views[0].width * factor)} pixels{' with gradients' * grads}"
             found.append(f"{what} {median(sum(milliseconds[1:], [])):.2f} ms")
     return f"{len(scene):,} Gaussians: {', '.join(found)}"
@@ -226,11 +264,16 @@ def times(scene: ps.Gaussians, device: torch.device, backend: str, rounds: int =
 def beside_gsplat(scene: ps.Gaussians, device: torch.device) -> str:
     """Pictures and gradients agree with gsplat's."""
     scene = scene.to(device)
-    image, gradient = 0.0, 0.0
+    image = 0.0
+    gradient = 0.0
     for view in ps.sample_views(scene, 4):
-        (ours, ours_by), (theirs, theirs_by) = (drawn(scene, view, 1.0, name, True) for name in ("torch", "gsplat"))
+        (ours, ours_by), (theirs, theirs_by) = (
+            drawn(scene, view, 1.0, name, True) for name in ("torch", "gsplat")
+        )
         image = max(image, float((ours - theirs).abs().max()))
-        relative = (float((a - b).norm() / b.norm()) for a, b in zip(ours_by, theirs_by, strict=True))
+        relative = (
+            float((a - b).norm() / b.norm()) for a, b in zip(ours_by, theirs_by, strict=True)
+        )
         gradient = max(gradient, *relative)
     text = f"largest difference: image {image:.1e}, gradients {gradient:.1e} of their norm"
     assert image <= NEAR_GSPLAT[0] and gradient <= NEAR_GSPLAT[1], text
@@ -238,13 +281,18 @@ def beside_gsplat(scene: ps.Gaussians, device: torch.device) -> str:
 
 
 def passes(name: str, check: Check) -> bool:
-    """Run a check and print a line about it; whether it passed. What it prints itself is shown only if it failed."""
-    begun, said = time.monotonic(), io.StringIO()
+    """Run a check and print a line about it; whether it passed. What it prints itself is shown only
+    if it failed."""
+    begun = time.monotonic()
+    said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             text = check()
     except Exception as error:  # any: the others are still worth running
-        print(f"FAIL  {name} ({time.monotonic() - begun:.0f} s): {type(error).__name__}: {error}", flush=True)
+        print(
+            f"FAIL  {name} ({time.monotonic() - begun:.0f} s): {type(error).__name__}: {error}",
+            flush=True,
+        )
         print(said.getvalue()[-2000:] + traceback.format_exc(), file=sys.stderr, flush=True)
         return False
     print(f"pass  {name} ({time.monotonic() - begun:.0f} s): {text}", flush=True)
@@ -262,14 +310,17 @@ def main(
 
     Args:
         device: the device that is compared with the CPU. "cpu" tries the program itself.
-        steps: number of steps of each training, half of which are taken after it was resumed; at least 2.
+        steps: number of steps of each training, half of which are taken after it was resumed; at
+            least 2.
         every: of scenes, every so many-th Gaussian is taken.
         resolution: pixels of the pictures that compact compares.
         gsplat: compare with gsplat, if it is installed and the device is a GPU.
     """
     place = torch.device(device)
     if steps < 2 or every < 1:
-        raise PointSplatError(f"{steps} steps, every {every}; expected at least 2 steps, every 1 or more")
+        raise PointSplatError(
+            f"{steps} steps, every {every}; expected at least 2 steps, every 1 or more"
+        )
     if place.type == "cuda" and not torch.cuda.is_available():
         raise PointSplatError("no CUDA device; expected one, or --device cpu")
     begun = time.monotonic()

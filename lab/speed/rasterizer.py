@@ -1,10 +1,11 @@
 """Time and errors of the rasterizer in a synthetic room, all in one run.
 
     python -m lab.speed.rasterizer
-    python -m lab.speed.rasterizer --variants eager compiled balanced fast --sizes 640x480 --json out.json
+    python -m lab.speed.rasterizer --variants eager compiled balanced fast --sizes 640x480 --json
+    out.json
 
-Machines differ and are shared: compare figures of one run, by their ratios. On a busy machine `--cpu-time` counts the
-CPU seconds of one thread. gsplat on a GPU is measured by cuda.py.
+Machines differ and are shared: compare figures of one run, by their ratios. On a busy machine
+`--cpu-time` counts the CPU seconds of one thread. gsplat on a GPU is measured by cuda.py.
 """
 
 from __future__ import annotations
@@ -48,14 +49,21 @@ class Case:
 
     def __init__(self, count: int, width: int, height: int):
         scene = room(count)
-        self.tensors = [t.requires_grad_() for t in (scene.means, scene.quats, scene.stds, scene.alphas, scene.sh)]
-        self.width, self.height = width, height
+        self.tensors = [
+            t.requires_grad_()
+            for t in (scene.means, scene.quats, scene.stds, scene.alphas, scene.sh)
+        ]
+        self.width = width
+        self.height = height
         self.viewmat = torch.eye(4)
         self.viewmat[2, 3] = 2.0
         focal = FOCAL * width
         self.K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
         g = torch.Generator().manual_seed(1)
-        self.grads = torch.randn(height, width, 3, generator=g), torch.randn(height, width, 1, generator=g)
+        self.grads = (
+            torch.randn(height, width, 3, generator=g),
+            torch.randn(height, width, 1, generator=g),
+        )
 
     def draw(self, variant: str) -> tuple[Tensor, Tensor]:
         """An image (H, W, 3) and alphas (H, W, 1)."""
@@ -76,12 +84,20 @@ class Case:
         return _spans(marks, [f"{name} {what}" for what in ("inference", "forward", "backward")])
 
     def time_blending(self) -> dict[str, float]:
-        """Seconds of blending both ways as in training, compiled where it is so by default, without the lists of
-        tiles, and of one exponential in numbers that stay in the cache, on one thread."""
+        """Seconds of blending both ways as in training, compiled where it is so by default, without
+        the lists of tiles, and of one exponential in numbers that stay in the cache, on one
+        thread."""
         seen = project(*self.tensors[:4], camera_of(self.viewmat, self.K, self.width, self.height))
-        colors = sh_to_color(seen.directions, self.tensors[4][:, 0], self.tensors[4][:, 1:], 3, seen.ids)
-        leaves = [t.detach().requires_grad_() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities, colors)]
-        seen = replace(seen, **dict(zip(("means2d", "cov2d", "det", "opacities"), leaves, strict=False)))
+        colors = sh_to_color(
+            seen.directions, self.tensors[4][:, 0], self.tensors[4][:, 1:], 3, seen.ids
+        )
+        leaves = [
+            t.detach().requires_grad_()
+            for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities, colors)
+        ]
+        seen = replace(
+            seen, **dict(zip(("means2d", "cov2d", "det", "opacities"), leaves, strict=False))
+        )
         footprints = Footprints(seen, self.width, self.height)
         marks = [now()]
         drawn = blend(seen, leaves[4], footprints)
@@ -90,7 +106,8 @@ class Case:
         marks.append(now())
         footprints.tiles()
         marks.append(now())
-        numbers, calls = torch.full((2**12,), -1.0), 200
+        numbers = torch.full((2**12,), -1.0)
+        calls = 200
         with one_thread():
             for _ in range(calls):
                 torch.exp2(numbers)
@@ -105,7 +122,11 @@ class Case:
         """Gaussians that are drawn, and pairs of them and a pixel."""
         seen = project(*self.tensors[:4], camera_of(self.viewmat, self.K, self.width, self.height))
         counts = sum_over_pixels(
-            seen, self.width, self.height, 1, lambda block: (block.alpha > 0).sum(-1, keepdim=True).to(block.alpha)
+            seen,
+            self.width,
+            self.height,
+            1,
+            lambda block: (block.alpha > 0).sum(-1, keepdim=True).to(block.alpha),
         )
         return int((counts > 0).sum()), int(counts.double().sum())
 
@@ -121,8 +142,13 @@ def measured(case: Case, variants: tuple[str, ...], repeats: int, budget: float)
         exact = case.draw("eager")[0].clamp(0, 1)
         for name in variants:
             image = case.draw(name)[0].clamp(0, 1)
-            errors |= {f"{name} max": float((image - exact).abs().max()), f"{name} PSNR": float(psnr(image, exact))}
-    functions = {name: partial(case.time_variant, name) for name in variants} | {"blending": case.time_blending}
+            errors |= {
+                f"{name} max": float((image - exact).abs().max()),
+                f"{name} PSNR": float(psnr(image, exact)),
+            }
+    functions = {name: partial(case.time_variant, name) for name in variants} | {
+        "blending": case.time_blending
+    }
     seconds = timed(functions, repeats, budget)
     visible, pairs = case.drawn()
     row: Row = {"gaussians": len(case.tensors[0]), "width": case.width, "height": case.height}
@@ -131,12 +157,14 @@ def measured(case: Case, variants: tuple[str, ...], repeats: int, budget: float)
 
 def show(rows: list[Row], variants: tuple[str, ...]) -> None:
     """Print milliseconds, ratios and errors; the first variant is what ratios refer to."""
-    ms, ratio = number(1, 1e3), number(2)
+    ms = number(1, 1e3)
+    ratio = number(2)
 
     def both(row: Row, name: str) -> float:
         return row["seconds"][f"{name} forward"] + row["seconds"][f"{name} backward"]
 
-    heads, lines = ["Gaussians", "visible", "size"], []
+    heads = ["Gaussians", "visible", "size"]
+    lines = []
     timed_names = [name for name in rows[0]["seconds"] if name != "exponential"]
     for row in rows:
         line = [f"{row['gaussians']:,}", f"{row['visible']:,}", f"{row['width']}x{row['height']}"]
@@ -147,12 +175,23 @@ def show(rows: list[Row], variants: tuple[str, ...]) -> None:
     errors = list(rows[0]["errors"])
     for line, row in zip(lines, rows, strict=True):
         least = row["pairs"] * row["seconds"]["exponential"]
-        blending = row["seconds"]["blending"], row["seconds"]["blending"] + row["seconds"]["blending backward"]
+        blending = (
+            row["seconds"]["blending"],
+            row["seconds"]["blending"] + row["seconds"]["blending backward"],
+        )
         line[3:] = [f"{row['pairs'] / 1e6:.1f}", *(ratio(span / least) for span in blending)]
         line += [ratio(both(row, name) / both(row, variants[0])) for name in variants[1:]]
-        line += [f"{row['errors'][name]:{'.1f' if name.endswith('PSNR') else '.1e'}}" for name in errors]
-    title = "Blending over one exponential for each pair of a Gaussian and a pixel on which it is drawn; forward and "
-    title += "backward over those of the first variant; errors against the exact image (colour units, dB)"
+        line += [
+            f"{row['errors'][name]:{'.1f' if name.endswith('PSNR') else '.1e'}}" for name in errors
+        ]
+    title = (
+        "Blending over one exponential for each pair of a Gaussian and a pixel on which it is "
+        "drawn; forward and "
+    )
+    title += (
+        "backward over those of the first variant; errors against the exact image (colour units, "
+        "dB)"
+    )
     console().print(table(title, [*heads, *of_pairs, *ratios, *errors], lines))
 
 
@@ -185,7 +224,9 @@ def main(
     """
     unknown = [name for name in variants if name not in VARIANTS]
     if unknown or not variants:
-        raise PointSplatError(f"no variant is called {', '.join(unknown)!r}; expected some of {', '.join(VARIANTS)}")
+        raise PointSplatError(
+            f"no variant is called {', '.join(unknown)!r}; expected some of {', '.join(VARIANTS)}"
+        )
     if cpu_time:
         torch.set_num_threads(1)
         use_cpu_time()
@@ -195,7 +236,11 @@ def main(
     for count in gaussians:
         for width, height in map(_size_of, sizes):
             rows.append(measured(Case(count, width, height), variants, repeats, budget))
-            settings = {"torch": torch.__version__, "threads": torch.get_num_threads(), "clock": clock}
+            settings = {
+                "torch": torch.__version__,
+                "threads": torch.get_num_threads(),
+                "clock": clock,
+            }
             write_json(json, settings | {"cases": rows})
     show(rows, variants)
 

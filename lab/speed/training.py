@@ -3,9 +3,10 @@
     python -m lab.speed.training outputs/kitchen/splatfacto-cpu/RUN --downscale 1 2
     python -m lab.speed.training outputs/kitchen/splatfacto-cpu/RUN --refiner
 
-Steps of ``splatfacto-cpu`` continue from the end of a finished training whose photos are at hand, at its number of
-Gaussians; those of a refiner begin with a new network on that scene. They alternate between ours and ours without
-compiled kernels, so that a busy moment hits both. CPU seconds of one thread are counted, and nothing is saved.
+Steps of ``splatfacto-cpu`` continue from the end of a finished training whose photos are at hand,
+at its number of Gaussians; those of a refiner begin with a new network on that scene. They
+alternate between ours and ours without compiled kernels, so that a busy moment hits both. CPU
+seconds of one thread are counted, and nothing is saved.
 """
 
 from __future__ import annotations
@@ -33,14 +34,22 @@ DRAWING = {
     "blending, backward": ("BlendBackward",),
     "projection": ("CompiledProject", "Project"),
     "projection, backward": ("CompiledProjectBackward", "ProjectBackward"),
-    "colours by SH, both ways": ("CompiledColor", "CompiledColorBackward", "Color", "ColorBackward"),
+    "colours by SH, both ways": (
+        "CompiledColor",
+        "CompiledColorBackward",
+        "Color",
+        "ColorBackward",
+    ),
     "SSIM, both ways": ("CompiledSimilarity", "CompiledSimilarityBackward"),
 }
 """Events of torch's profiler that are a part of a step."""
 
 NETWORK = {
     "linear layers, both ways": ("aten::linear", "AddmmBackward0"),
-    "attention, both ways": ("aten::scaled_dot_product_attention", "ScaledDotProductFlashAttentionForCpuBackward0"),
+    "attention, both ways": (
+        "aten::scaled_dot_product_attention",
+        "ScaledDotProductFlashAttentionForCpuBackward0",
+    ),
     "sparse convolutions, both ways": ("_SubmanifoldConv", "_SubmanifoldConvBackward"),
 }
 """And those of a refiner."""
@@ -52,7 +61,8 @@ WARM_UP = 2
 
 
 def _trainer(run: Path, folder: Path) -> Any:
-    """nerfstudio's trainer of the run's data, with its Gaussians, all SH bands and no densification."""
+    """nerfstudio's trainer of the run's data, with its Gaussians, all SH bands and no
+    densification."""
     config = splatfacto_cpu_config()
     config.pipeline.datamanager.dataparser = dataparser_of(open_run(run)).config  # type: ignore[attr-defined]
     trainer = _started(config, None, folder)
@@ -60,14 +70,17 @@ def _trainer(run: Path, folder: Path) -> Any:
     for name, value in ps.load(run).items():
         model.gauss_params[name] = torch.nn.Parameter(value)
     model._adopt_optimizers(trainer.optimizers)
-    model.optimizers, model.step = trainer.optimizers.optimizers, config.max_num_iterations
+    model.optimizers = trainer.optimizers.optimizers
+    model.step = config.max_num_iterations
     model.train()
     return trainer
 
 
 def _started(config: Any, data: Path | None, folder: Path) -> Any:
     """nerfstudio's trainer of a config before its first step, on a CPU."""
-    config.machine.device_type, config.output_dir, config.vis = "cpu", folder, "tensorboard"
+    config.machine.device_type = "cpu"
+    config.output_dir = folder
+    config.vis = "tensorboard"
     config.data = config.pipeline.datamanager.data = data
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
@@ -76,7 +89,8 @@ def _started(config: Any, data: Path | None, folder: Path) -> Any:
 
 
 def _measured(trainer: Any, step: int, count: int, parts: dict[str, tuple[str, ...]]) -> str:
-    """Seconds of a step with and without compiled kernels, and shares of the parts of one with them, as a table.
+    """Seconds of a step with and without compiled kernels, and shares of the parts of one with
+    them, as a table.
 
     Args:
         trainer: whose steps are taken.
@@ -105,16 +119,25 @@ def _measured(trainer: Any, step: int, count: int, parts: dict[str, tuple[str, .
             take("ours")
         total = time.perf_counter() - start
     spent_in = {event.key: event.cpu_time_total / 1e6 for event in found.key_averages()}
-    shares = {part: sum(spent_in.get(event, 0.0) for event in events) / total for part, events in parts.items()}
+    shares = {
+        part: sum(spent_in.get(event, 0.0) for event in events) / total
+        for part, events in parts.items()
+    }
     shares["the rest"] = 1 - sum(shares.values())
     ours = median(seconds["ours"])
-    lines = [[kind, f"{median(taken):.3f}", f"{median(taken) / ours:.2f}"] for kind, taken in seconds.items()]
+    lines = [
+        [kind, f"{median(taken):.3f}", f"{median(taken) / ours:.2f}"]
+        for kind, taken in seconds.items()
+    ]
     lines += [[part, percent(round(share, 2)), ""] for part, share in shares.items()]
     return markdown(["a step", "CPU s, or share", "ratio"], lines)
 
 
 def main(
-    run: tyro.conf.Positional[Path], downscale: tuple[int, ...] = (1,), count: int = 6, refiner: bool = False
+    run: tyro.conf.Positional[Path],
+    downscale: tuple[int, ...] = (1,),
+    count: int = 6,
+    refiner: bool = False,
 ) -> None:
     """Print a table for each size of the photos.
 
@@ -130,7 +153,10 @@ def main(
             trainer = _started(pointsplat_config(), run, Path(folder))
             model = trainer.pipeline.train().model
             text = _measured(trainer, 0, count, DRAWING | NETWORK | ADAM)
-            print(f"{model.config.size} network, {len(model.pruned_scene(0).pruned):,} Gaussians:\n\n{text}")
+            print(
+                f"{model.config.size} network, {len(model.pruned_scene(0).pruned):,} "
+                f"Gaussians:\n\n{text}"
+            )
             return
         trainer = _trainer(run, Path(folder))
         model = trainer.pipeline.model

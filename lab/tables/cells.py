@@ -44,39 +44,42 @@ class Tables:
 
     @classmethod
     def read(cls, folder: Path, force: bool = False) -> Tables:
-        """The tables of a folder; none if it has none. Raises SceneError if its file cannot be read, or there are files
-        of others; with ``force`` there are none yet."""
+        """The tables of a folder; none if it has none. Raises SceneError if its file cannot be
+        read, or there are files of others; with ``force`` there are none yet."""
         path = folder / FILES[0]
         if force:
             return cls()
         if not path.exists():
             if others := [name for name in FILES if (folder / name).exists()]:
                 raise SceneError(
-                    f"{folder / others[0]}: exists already; name another folder, or start over with --force"
+                    f"{folder / others[0]}: exists already; name another folder, or start over "
+                    "with --force"
                 )
             return cls()
         try:
             return cls.of(json.loads(path.read_text("utf-8")))
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise SceneError(
-                f"{path}: not the cells of tables ({error!r:.80}); name another folder, or start over with --force"
+                f"{path}: not the cells of tables ({error!r:.80}); name another folder, or start "
+                "over with --force"
             ) from error
 
     def enter(self, name: str, about: Row, group: str | None) -> None:
-        """Enter a scene, or find it: a SceneError if existing cells are of another file, other views or another
-        machine. Its group stays, if none is given."""
+        """Enter a scene, or find it: a SceneError if existing cells are of another file, other
+        views or another machine. Its group stays, if none is given."""
         known = self.scenes.get(name, {})
         for fact, value in about["of"].items() if known else ():
             if (before := known.get("of", {}).get(fact)) != value:
                 raise SceneError(
-                    f"{name}: its cells are of another {fact.replace('_', ' ')} ({before}, now {value}); name another "
-                    "folder, or start over with --force"
+                    f"{name}: its cells are of another {fact.replace('_', ' ')} ({before}, now "
+                    f"{value}); name another folder, or start over with --force"
                 )
         group = group or known.get("group") or about["dataset"] or "scenes"
         self.scenes[name] = {**known, **about, "group": group}
 
     def groups(self) -> dict[str, list[str]]:
-        """Names of the scenes with cells by group; the paper's datasets first, the others by name."""
+        """Names of the scenes with cells by group; the paper's datasets first, the others by
+        name."""
         measured = {key.split("/")[0] for key in self.cells}
         found: dict[str, list[str]] = {}
         for name in sorted(measured, key=lambda name: self.scenes[name]["group"]):
@@ -94,19 +97,26 @@ class Tables:
         return datasets.pop() if len(datasets) == 1 and datasets <= {*PROTOCOL.datasets} else ""
 
     def comparable(self, names: Sequence[str]) -> str:
-        """The dataset whose published figures compare with these scenes': all are of it, and were measured by the
-        paper's protocol; empty if there is none."""
+        """The dataset whose published figures compare with these scenes': all are of it, and were
+        measured by the paper's protocol; empty if there is none."""
         known = [self.scenes[name].get("differs", "measured by an older version") for name in names]
         return "" if any(known) else self.dataset(names)
 
     def save(self, folder: Path) -> None:
         """Write all figures as JSON."""
-        groups, paper = self.groups(), {}
+        groups = self.groups()
+        paper = {}
         for group, names in groups.items():
             if dataset := self.comparable(names):
-                cells = {(c["way"], c["point"]["share"]) for k, c in self.cells.items() if k.split("/")[0] in names}
+                cells = {
+                    (c["way"], c["point"]["share"])
+                    for k, c in self.cells.items()
+                    if k.split("/")[0] in names
+                }
                 paper[group] = {
-                    f"table {number}, {way}, {100 * share:g}%": dict(zip(METRICS, figures, strict=True))
+                    f"table {number}, {way}, {100 * share:g}%": dict(
+                        zip(METRICS, figures, strict=True)
+                    )
                     for number in (1, 3, 4)
                     for way, share in sorted(cells)
                     if (figures := published(number, dataset, way, share))
@@ -114,4 +124,6 @@ class Tables:
         scenes = [self.scenes[name] for names in groups.values() for name in names]
         content = {"groups": groups, "scenes": scenes, "cells": list(self.cells.values())}
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / FILES[0], FORMAT | content | {"paper": paper, "not_measured": self.missing})
+        write_json(
+            folder / FILES[0], FORMAT | content | {"paper": paper, "not_measured": self.missing}
+        )

@@ -18,9 +18,16 @@ OPACITY_EDGES = np.linspace(0.0, 1.0, 41)
 """Edges of the bins of opacity."""
 
 VOLUME_EDGES = np.linspace(-20.0, 4.0, 49)
-"""Edges of the bins of log10 of the volume, scene units cubed; values outside count in the first or the last bin."""
+"""Edges of the bins of log10 of the volume, scene units cubed; values outside count in the first or
+the last bin."""
 
-COLORS = {"dense": "black", "lightgaussian": "tab:orange", "pup": "gray", "paper": "tab:blue", "merge": "tab:green"}
+COLORS = {
+    "dense": "black",
+    "lightgaussian": "tab:orange",
+    "pup": "gray",
+    "paper": "tab:blue",
+    "merge": "tab:green",
+}
 
 Group = dict[str, list[str]]
 """Names of scenes, by the name of their group."""
@@ -38,39 +45,59 @@ def distributions(scene: Gaussians) -> tuple[list[int], list[int]]:
 
 
 def share_of_figure(cells: dict[str, Row], names: list[str]) -> float:
-    """The paper's share where the paper's selection was measured at it, or else the largest measured share."""
-    keys = {key for key, cell in cells.items() if cell["way"] == WAYS.paper.name and cell["opacities"]}
+    """The paper's share where the paper's selection was measured at it, or else the largest
+    measured share."""
+    keys = {
+        key for key, cell in cells.items() if cell["way"] == WAYS.paper.name and cell["opacities"]
+    }
     shares = {cells[key]["point"]["share"] for key in keys if key.split("/")[0] in names}
-    return PROTOCOL.figure_share if PROTOCOL.figure_share in shares else max(shares, default=PROTOCOL.figure_share)
+    return (
+        PROTOCOL.figure_share
+        if PROTOCOL.figure_share in shares
+        else max(shares, default=PROTOCOL.figure_share)
+    )
 
 
 def densities(cells: dict[str, Row], names: list[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Shares of the Gaussians in each bin of opacity and of volume by way: means over the scenes of a group that have
-    every way which any of them has."""
+    """Shares of the Gaussians in each bin of opacity and of volume by way: means over the scenes of
+    a group that have every way which any of them has."""
     share = share_of_figure(cells, names)
-    keys = {w.name: [cell_key(name, w, 1.0 if w == WAYS.dense else share) for name in names] for w in WAYS.figure_4}
-    there = {w: {k.split("/")[0] for k in of if cells.get(k, {}).get("opacities")} for w, of in keys.items()}
+    keys = {
+        w.name: [cell_key(name, w, 1.0 if w == WAYS.dense else share) for name in names]
+        for w in WAYS.figure_4
+    }
+    there = {
+        w: {k.split("/")[0] for k in of if cells.get(k, {}).get("opacities")}
+        for w, of in keys.items()
+    }
     measured = [scenes for scenes in there.values() if scenes]
     over = set.intersection(*measured) if measured else set()
     found = {}
     for way, of in keys.items():
         counts = [cells[key] for key in of if key in cells and key.split("/")[0] in over]
         if counts:
-            shares = ([np.array(c[kind]) / sum(c[kind]) for c in counts] for kind in ("opacities", "volumes"))
+            shares = (
+                [np.array(c[kind]) / sum(c[kind]) for c in counts]
+                for kind in ("opacities", "volumes")
+            )
             opacity, volume = (np.mean(each, axis=0) for each in shares)
             found[way] = (opacity, volume)
     return found
 
 
 def medians(cells: dict[str, Row], names: list[str]) -> dict[str, tuple[float, float]]:
-    """Medians of opacity and of log10 of the volume (scene units cubed), by way, interpolated within bins."""
+    """Medians of opacity and of log10 of the volume (scene units cubed), by way, interpolated
+    within bins."""
 
     def middle(shares: np.ndarray, edges: np.ndarray) -> float:
         below = np.concatenate([[0.0], np.cumsum(shares)])  # share of the Gaussians below each edge
         return float(np.interp(0.5 * below[-1], below, edges))
 
     found = densities(cells, names).items()
-    return {way: (middle(opacity, OPACITY_EDGES), middle(volume, VOLUME_EDGES)) for way, (opacity, volume) in found}
+    return {
+        way: (middle(opacity, OPACITY_EDGES), middle(volume, VOLUME_EDGES))
+        for way, (opacity, volume) in found
+    }
 
 
 def plot_figure(cells: dict[str, Row], groups: Group, path: Path) -> None:
@@ -78,13 +105,22 @@ def plot_figure(cells: dict[str, Row], groups: Group, path: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.6 * len(groups)), layout="constrained")
-    for (name, scenes), axes in zip(groups.items(), figure.subplots(len(groups), 2, squeeze=False), strict=True):
+    for (name, scenes), axes in zip(
+        groups.items(), figure.subplots(len(groups), 2, squeeze=False), strict=True
+    ):
         found = densities(cells, scenes)
         for way in WAYS.figure_4:
-            for axis, shares, edges in zip(axes, found.get(way.name, ()), (OPACITY_EDGES, VOLUME_EDGES), strict=False):
+            for axis, shares, edges in zip(
+                axes, found.get(way.name, ()), (OPACITY_EDGES, VOLUME_EDGES), strict=False
+            ):
                 style = "--" if way == WAYS.dense else "-"
                 axis.stairs(
-                    100 * shares, edges, color=COLORS[way.name], linestyle=style, label=way.label, linewidth=1.4
+                    100 * shares,
+                    edges,
+                    color=COLORS[way.name],
+                    linestyle=style,
+                    label=way.label,
+                    linewidth=1.4,
                 )
         if found:
             filled = np.flatnonzero(np.max([volume for _, volume in found.values()], axis=0) > 1e-3)
@@ -94,5 +130,7 @@ def plot_figure(cells: dict[str, Row], groups: Group, path: Path) -> None:
         axes[1].set_xlabel("log10 of the volume, scene units cubed")
     drawn = [axis for axis in figure.axes if axis.has_data()]
     if drawn:
-        figure.legend(*drawn[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8)
+        figure.legend(
+            *drawn[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8
+        )
     save_figure(figure, path)

@@ -24,13 +24,15 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import name_of
 from pointsplat_ns.rasterizer import render
 
-FEW, HALF = PROTOCOL.ablation_share, PROTOCOL.figure_share
+FEW = PROTOCOL.ablation_share
+HALF = PROTOCOL.figure_share
 COLUMNS = {
     1: ((WAYS.paper, FEW), (WAYS.pointsplat, FEW)),
     3: ((WAYS.dense, 1.0), (WAYS.splatformer, HALF), (WAYS.pointsplat, HALF)),
     5: ((WAYS.dense, 1.0), *((way, FEW) for _, way in WAYS.table_3 if way.network is None)),
 }
-"""Ways and shares side by side, by the number of the figure. The paper does not say the share of Figures 1 and 5."""
+"""Ways and shares side by side, by the number of the figure. The paper does not say the share of
+Figures 1 and 5."""
 
 
 def solid(scene: Gaussians) -> Gaussians:
@@ -54,8 +56,8 @@ def main(
     """Draw one of the paper's figures.
 
     Args:
-        number: 1: selected and refined Gaussians, in a picture and as ellipsoids. 3: photo, dense scene, SplatFormer
-            and PointSplat. 4: opacity and volume. 5: selections at five lambdas.
+        number: 1: selected and refined Gaussians, in a picture and as ellipsoids. 3: photo, dense
+            scene, SplatFormer and PointSplat. 4: opacity and volume. 5: selections at five lambdas.
         scenes: as for ``python -m lab.tables``; for Figure 4 its output folder.
         output: a picture, such as figure3.png.
         refiners: weights, as for ``python -m lab.tables``.
@@ -69,10 +71,12 @@ def main(
     if number == 4:
         tables = Tables.read(scenes[0])
         return plot_figure(tables.cells, tables.groups(), output)
-    tools, rows = Tools(Options(views, side), Refiners(refiners)), []
+    tools = Tools(Options(views, side), Refiners(refiners))
+    rows = []
     for path in scenes:
         scene = open_scene(path, data, tools.options)
-        maker, look = Maker(scene, name_of(path), tools), scene.held_out.views[view]
+        maker = Maker(scene, name_of(path), tools)
+        look = scene.held_out.views[view]
         made = {}
         for way, share in COLUMNS[number]:
             if why := tools.missing(way, share, maker.name):
@@ -80,11 +84,19 @@ def main(
             label = f"{way.label}, {percent(share)}"
             label += "" if way.opacity_weight is None else f", lambda {way.opacity_weight:g}"
             made[label] = maker.make(way, share)[0][0]
-        photo = {"photo": scene.held_out.photos[view]} if number == 3 and scene.held_out.photos else {}
+        photo = (
+            {"photo": scene.held_out.photos[view]} if number == 3 and scene.held_out.photos else {}
+        )
         rows.append(photo | {label: render(small, look) for label, small in made.items()})
         if number != 3:
-            rows.append({f"{label}: ellipsoids": render(solid(small), look) for label, small in made.items()})
-    columns, high = max(map(len, rows)), 3.2 * look.height / look.width + 0.3
+            rows.append(
+                {
+                    f"{label}: ellipsoids": render(solid(small), look)
+                    for label, small in made.items()
+                }
+            )
+    columns = max(map(len, rows))
+    high = 3.2 * look.height / look.width + 0.3
     figure = Figure(figsize=(3.2 * columns, high * len(rows)), layout="constrained")
     for axis in (axes := figure.subplots(len(rows), columns, squeeze=False)).flat:
         axis.set_axis_off()

@@ -20,10 +20,13 @@ from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
 from pointsplat_ns.io.files import replacing, three_digits
 
 READING = (
-    "Figures are means over the same scenes in all rows of a table, but for rows with a mark. PSNR (dB), SSIM and "
-    'LPIPS (AlexNet) are against held-out photos; those of "renders" against the dense scene\'s own renders in the '
-    'same poses. "Loses most" names the scene that loses most PSNR compared to its dense scene, with its PSNR and the '
-    "difference; among dense scenes it is the one of the least PSNR. The spread is the standard deviation of PSNR over "
+    "Figures are means over the same scenes in all rows of a table, but for rows with a mark. "
+    "PSNR (dB), SSIM and "
+    'LPIPS (AlexNet) are against held-out photos; those of "renders" against the dense scene\'s '
+    "own renders in the "
+    'same poses. "Loses most" names the scene that loses most PSNR compared to its dense scene, '
+    "with its PSNR and the difference; among dense scenes it is the one of the least PSNR. The "
+    "spread is the standard deviation of PSNR over "
     "trainings that differ by their seed. \\*: nothing is fine-tuned or refined. Frames a "
     "second compare on an idle machine alone."
 )
@@ -51,35 +54,63 @@ class Table:
 
 
 class Layout:
-    """Makes the tables of a group of scenes. ``keeps`` are the shares of Tables 1 and 2, to which those of measured
-    cells are added."""
+    """Makes the tables of a group of scenes. ``keeps`` are the shares of Tables 1 and 2, to which
+    those of measured cells are added."""
 
     def __init__(self, tables: Tables, group: str, names: Sequence[str], keeps: Sequence[float]):
-        self.all, self.group, self.names = tables, group, names
+        self.all = tables
+        self.group = group
+        self.names = names
         self.cells = {key: cell for key, cell in tables.cells.items() if key.split("/")[0] in names}
-        of_table_1 = {way.name for way in WAYS.table_1} - {way.name for way in WAYS.table_4}  # Table 4 has other shares
-        measured = {cell["point"]["share"] for cell in self.cells.values() if cell["way"] in of_table_1}
+        of_table_1 = {way.name for way in WAYS.table_1} - {
+            way.name for way in WAYS.table_4
+        }  # Table 4 has other shares
+        measured = {
+            cell["point"]["share"] for cell in self.cells.values() if cell["way"] in of_table_1
+        }
         self.shares = sorted({*keeps, *measured}, reverse=True)
         self.frame = pd.DataFrame([_flat(key, cell) for key, cell in self.cells.items()])
         self.frame = self.frame.set_index(["way", "share", "scene"]).sort_index()
-        dense = self.frame["photos_psnr"].xs(("dense", 1.0)) if ("dense", 1.0) in self.frame.index else pd.Series()
-        self.frame["lost"] = self.frame.index.get_level_values("scene").map(dense) - self.frame["photos_psnr"]
+        dense = (
+            self.frame["photos_psnr"].xs(("dense", 1.0))
+            if ("dense", 1.0) in self.frame.index
+            else pd.Series()
+        )
+        self.frame["lost"] = (
+            self.frame.index.get_level_values("scene").map(dense) - self.frame["photos_psnr"]
+        )
         self.has_photos = bool(self.frame["photos_psnr"].notna().any())
 
     def tables(self) -> list[Table]:
         """Tables 1 to 4, and the medians of Figure 4 where it has any."""
-        every = [(WAYS.dense, 1.0), *((way, share) for share in self.shares for way in WAYS.table_1)]
+        every = [
+            (WAYS.dense, 1.0),
+            *((way, share) for share in self.shares for way in WAYS.table_1),
+        ]
         few = [(way, share) for way, share in every if way == WAYS.dense or way in WAYS.table_2]
         share = PROTOCOL.ablation_share
         lambdas = [((f"{weight:g}", way.label), way, share) for weight, way in WAYS.table_3]
-        branches = (("", "", ""), ("yes", "", ""), ("yes", "", "yes"), ("yes", "yes", ""), ("yes", "yes", "yes"))
+        branches = (
+            ("", "", ""),
+            ("yes", "", ""),
+            ("yes", "", "yes"),
+            ("yes", "yes", ""),
+            ("yes", "yes", "yes"),
+        )
         models = zip(("I", "II", "III", "IV", "V"), branches, WAYS.table_4, strict=True)
         parts = [((name, *used), way, share) for name, used, way in models]
         first = ("kept", "method")
         return [
-            self._quality(1, "What is left at a number of Gaussians", first, list(map(_named, every))),
+            self._quality(
+                1, "What is left at a number of Gaussians", first, list(map(_named, every))
+            ),
             self._efficiency(first, list(map(_named, few))),
-            self._quality(3, f"Lambda of the paper's score, {percent(share)} kept", ("lambda", "method"), lambdas),
+            self._quality(
+                3,
+                f"Lambda of the paper's score, {percent(share)} kept",
+                ("lambda", "method"),
+                lambdas,
+            ),
             self._quality(
                 4,
                 f"The dual-branch encoder, {percent(share)} kept",
@@ -90,24 +121,37 @@ class Layout:
         ]
 
     def _quality(self, which: int, title: str, first: tuple[str, ...], rows: list[tuple]) -> Table:
-        """A table of PSNR, SSIM, LPIPS, with the paper's PSNR and SSIM where dataset and protocol are the paper's."""
-        dataset, cells = self.all.comparable(self.names), [(way, share) for _, way, share in rows]
+        """A table of PSNR, SSIM, LPIPS, with the paper's PSNR and SSIM where dataset and protocol
+        are the paper's."""
+        dataset = self.all.comparable(self.names)
+        cells = [(way, share) for _, way, share in rows]
         theirs = {cell: published(which, dataset, cell[0].name, cell[1]) for cell in cells}
         kinds = (["photos"] if self.has_photos else []) + ["renders"]
-        heads = [name.upper() + " (renders)" * (kind == "renders") for kind in kinds for name in WRITTEN]
-        spread, paper = ["spread"] * (which == 4), ["PSNR (paper)", "SSIM (paper)"] * any(theirs.values())
+        heads = [
+            name.upper() + " (renders)" * (kind == "renders") for kind in kinds for name in WRITTEN
+        ]
+        spread = ["spread"] * (which == 4)
+        paper = ["PSNR (paper)", "SSIM (paper)"] * any(theirs.values())
         heads += [*spread, "loses most", "made with", "scenes", *paper]
 
         def figures(same: pd.DataFrame, mean: pd.Series) -> list[str]:
-            found = [_text(write, mean[f"{kind}_{name}"]) for kind in kinds for name, write in WRITTEN.items()]
+            found = [
+                _text(write, mean[f"{kind}_{name}"])
+                for kind in kinds
+                for name, write in WRITTEN.items()
+            ]
             found += [_spread(same)] * (which == 4)
             return [*found, _worst(same), ", ".join(dict.fromkeys(map(_made, same["made_with"])))]
 
         def more(cell: Cell) -> list[str]:
             known = (theirs[cell] or (None, None))[:2]
-            return [_text(write, value) for write, value in zip(WRITTEN.values(), known, strict=False)]
+            return [
+                _text(write, value) for write, value in zip(WRITTEN.values(), known, strict=False)
+            ]
 
-        return self._table(which, title, first, heads, rows, figures, more if any(theirs.values()) else None)
+        return self._table(
+            which, title, first, heads, rows, figures, more if any(theirs.values()) else None
+        )
 
     def _efficiency(self, first: tuple[str, ...], rows: list[tuple]) -> Table:
         def figures(same: pd.DataFrame, mean: pd.Series) -> list[str]:
@@ -115,7 +159,13 @@ class Layout:
             return [f"{mean['gaussians']:,.0f}", f"{frames:.3g}", three_digits(mean["bytes"] / 1e6)]
 
         return self._table(
-            2, "Efficiency", first, ["Gaussians", "frames a second", "MB", "scenes"], rows, figures, None
+            2,
+            "Efficiency",
+            first,
+            ["Gaussians", "frames a second", "MB", "scenes"],
+            rows,
+            figures,
+            None,
         )
 
     def _table(self, which, title, first, heads, rows, figures, more) -> Table:
@@ -133,10 +183,17 @@ class Layout:
         scenes = {}
         for _, way, share in rows:
             known = (way.name, share) in self.frame.index
-            scenes[way, share] = frozenset(self.frame.loc[way.name, share].index) if known else frozenset()
+            scenes[way, share] = (
+                frozenset(self.frame.loc[way.name, share].index) if known else frozenset()
+            )
         counts = Counter(names for names in scenes.values() if names)
-        over = max(counts, key=lambda names: (counts[names], len(names), sorted(names)), default=frozenset())
-        lines, marked = [], False
+        over = max(
+            counts,
+            key=lambda names: (counts[names], len(names), sorted(names)),
+            default=frozenset(),
+        )
+        lines = []
+        marked = False
         for words, way, share in rows:
             names = scenes[way, share]
             if not names:
@@ -146,14 +203,23 @@ class Layout:
                 same = self.frame.loc[way.name, share].loc[sorted(over if comparable else names)]
                 marked |= not comparable
                 mean = same.mean(numeric_only=True, skipna=False)
-                cells = [*figures(same, mean), f"{len(same)}" + f" {OTHER_SCENES}" * (not comparable)]
+                cells = [
+                    *figures(same, mean),
+                    f"{len(same)}" + f" {OTHER_SCENES}" * (not comparable),
+                ]
             lines.append((*words, *cells, *(more((way, share)) if more else ())))
         notes = []
         if marked:
-            notes = [f"{OTHER_SCENES}: not over the scenes of the other rows ({', '.join(sorted(over))})"]
+            notes = [
+                f"{OTHER_SCENES}: not over the scenes of the other rows ({', '.join(sorted(over))})"
+            ]
         title = f"{title}: {self.group}, {len(over)} scene{'s' * (len(over) != 1)}"
         return Table(
-            which, title, (*first, *heads), lines, notes + self._notes([(way, share) for _, way, share in rows])
+            which,
+            title,
+            (*first, *heads),
+            lines,
+            notes + self._notes([(way, share) for _, way, share in rows]),
         )
 
     def _notes(self, cells: list[Cell]) -> list[str]:
@@ -162,19 +228,29 @@ class Layout:
         for way, share in cells:
             for name in self.names:
                 if (key := cell_key(name, way, share)) not in self.cells:
-                    label, why = f"{way.label} ({percent(share)})", self.all.missing.get(key, "not yet")
-                    found.setdefault(why, {})[label if len(self.names) == 1 else f"{label} on {name}"] = None
+                    label = f"{way.label} ({percent(share)})"
+                    why = self.all.missing.get(key, "not yet")
+                    found.setdefault(why, {})[
+                        label if len(self.names) == 1 else f"{label} on {name}"
+                    ] = None
         return [f"Not measured, {why}: {', '.join(labels)}" for why, labels in found.items()]
 
     def _medians(self) -> list[Table]:
         found = medians(self.cells, list(self.names))
-        title = f"Medians of Figure 4: {self.group}, {percent(share_of_figure(self.cells, list(self.names)))} kept"
+        title = (
+            f"Medians of Figure 4: {self.group}, "
+            f"{percent(share_of_figure(self.cells, list(self.names)))} kept"
+        )
         rows = [
             (way.label, f"{found[way.name][0]:.2f}", f"{found[way.name][1]:.1f}")
             for way in WAYS.figure_4
             if way.name in found
         ]
-        return [Table(0, title, ("method", "opacity", "log10 of the volume"), rows, [])] if rows else []
+        return (
+            [Table(0, title, ("method", "opacity", "log10 of the volume"), rows, [])]
+            if rows
+            else []
+        )
 
 
 def _named(cell: Cell) -> tuple[tuple[str, str], Way, float]:
@@ -185,10 +261,17 @@ def _named(cell: Cell) -> tuple[tuple[str, str], Way, float]:
 def _flat(key: str, cell: Row) -> Row:
     """A cell's figures in one level."""
     point = cell["point"]
-    row = {"scene": key.split("/")[0], "way": cell["way"], **{n: point[n] for n in ("share", "gaussians", "bytes")}}
+    row = {
+        "scene": key.split("/")[0],
+        "way": cell["way"],
+        **{n: point[n] for n in ("share", "gaussians", "bytes")},
+    }
     for kind, target in (("renders", "against_dense"), ("photos", "against_photos")):
         found = point[target] or {}
-        row |= {f"{kind}_{name}": float("nan") if (v := found.get(name)) is None else v for name in WRITTEN}
+        row |= {
+            f"{kind}_{name}": float("nan") if (v := found.get(name)) is None else v
+            for name in WRITTEN
+        }
     more = {"trainings": cell.get("psnr", []), "made_with": cell["made_with"]}
     return row | {"frame_ms": point["frame_ms"], **more}
 
@@ -203,7 +286,8 @@ _TRAINED = re.compile(
 
 
 def _made(made_with: str) -> str:
-    """Encoder, size, steps, budget and loss of the networks that a cell was made with; or its first words."""
+    """Encoder, size, steps, budget and loss of the networks that a cell was made with; or its first
+    words."""
     if (found := _TRAINED.search(made_with)) is None:
         return made_with.split(" (")[0]
     encoder, keep, size, steps, loss, weight = found.groups()
@@ -217,12 +301,16 @@ def _spread(same: pd.DataFrame) -> str:
 
 
 def _worst(same: pd.DataFrame) -> str:
-    """The scene that loses most, or that has the least PSNR where that is not known; with its PSNR and the loss."""
+    """The scene that loses most, or that has the least PSNR where that is not known; with its PSNR
+    and the loss."""
     psnr = same["photos_psnr"].fillna(same["renders_psnr"])
     if psnr.isna().any():
         return "-"
-    order = pd.DataFrame({"lost": same["lost"].fillna(-psnr), "low": -psnr}).sort_values(["lost", "low"])
-    name, lost = order.index[-1], same["lost"][order.index[-1]]
+    order = pd.DataFrame({"lost": same["lost"].fillna(-psnr), "low": -psnr}).sort_values(
+        ["lost", "low"]
+    )
+    name = order.index[-1]
+    lost = same["lost"][order.index[-1]]
     return f"{name} {psnr[name]:.2f}" + (f" ({-lost:+.2f})" if lost and not pd.isna(lost) else "")
 
 
@@ -241,12 +329,14 @@ def markdown_table(table: Table) -> str:
     name = f"Table {table.number}. " if table.number else ""
     header, *rows = (list(map(escaped, row)) for row in (table.header, *table.rows))
     notes = "\n".join(f"- {escaped(note)}" for note in table.notes)
-    return "\n\n".join([f"**{name}{escaped(table.title)}**", markdown(header, rows), *([notes] if notes else [])])
+    return "\n\n".join(
+        [f"**{name}{escaped(table.title)}**", markdown(header, rows), *([notes] if notes else [])]
+    )
 
 
 def write_tables(tables: Tables, folder: Path, keeps: Sequence[float]) -> None:
-    """Write all files, if anything was measured. ``keeps`` are the shares of Table 1, for rows without
-    measurements."""
+    """Write all files, if anything was measured. ``keeps`` are the shares of Table 1, for rows
+    without measurements."""
     if not tables.cells:
         return
     tables.save(folder)
@@ -259,19 +349,41 @@ def write_tables(tables: Tables, folder: Path, keeps: Sequence[float]) -> None:
 
 def _markdown(tables: Tables, made_tables: dict[str, list[Table]]) -> str:
     machines = sorted({tables.scenes[key.split("/")[0]]["machine"] for key in tables.cells})
-    made = sorted({f"{cell['version']}, commit {cell['commit'] or 'unknown'}" for cell in tables.cells.values()})
-    parts = [READING, escaped(f"Measured on {'; '.join(machines)}, by pointsplat_ns {'; '.join(made)}.")]
+    made = sorted(
+        {
+            f"{cell['version']}, commit {cell['commit'] or 'unknown'}"
+            for cell in tables.cells.values()
+        }
+    )
+    parts = [
+        READING,
+        escaped(f"Measured on {'; '.join(machines)}, by pointsplat_ns {'; '.join(made)}."),
+    ]
     for group, names in tables.groups().items():
-        heads, lines = ["scene", "Gaussians", "judged in", "size", "differs from the paper in"], []
+        heads = ["scene", "Gaussians", "judged in", "size", "differs from the paper in"]
+        lines = []
         for about in map(tables.scenes.__getitem__, names):
             dense = tables.cells.get(cell_key(about["name"], WAYS.dense, 1.0))
             count = f"{dense['point']['gaussians']:,}" if dense else "-"
             size = f"{about['width']} x {about['height']}"
-            line = (about["name"], count, f"{about['views']} {about['origin']}", size, about.get("differs", ""))
+            line = (
+                about["name"],
+                count,
+                f"{about['views']} {about['origin']}",
+                size,
+                about.get("differs", ""),
+            )
             lines.append(list(map(escaped, line)))
         if tables.dataset(names) and tables.comparable(names):
-            parts_of_paper = "The paper does not say of which scenes its Table 2 and Figure 4 are; its LPIPS is by VGG."
+            parts_of_paper = (
+                "The paper does not say of which scenes its Table 2 and Figure 4 are; its LPIPS "
+                "is by VGG."
+            )
             parts.append(parts_of_paper)
-        parts += [f"## {escaped(group)}", markdown(heads, lines), *map(markdown_table, made_tables[group])]
+        parts += [
+            f"## {escaped(group)}",
+            markdown(heads, lines),
+            *map(markdown_table, made_tables[group]),
+        ]
     parts += [f"![Figure 4]({FILES[2]})", "*Figure 4: opacity and volume of the Gaussians kept.*"]
     return "\n\n".join(part.strip() for part in parts) + "\n"

@@ -1,9 +1,11 @@
-"""Trains all networks of the paper's Tables 1, 3 and 4, each for its row and share of the Gaussians.
+"""Trains all networks of the paper's Tables 1, 3 and 4, each for its row and share of the
+Gaussians.
 
     python -m lab.tables.networks outputs -o networks --held-out room35 phone
     python -m lab.tables RUN_OF_ROOM35 RUN_OF_PHONE -o tables --refiners networks
 
-The same command resumes: finished networks are left alone, an interrupted one resumes from its last step.
+The same command resumes: finished networks are left alone, an interrupted one resumes from its last
+step.
 """
 
 from __future__ import annotations
@@ -72,7 +74,9 @@ def jobs(seeds: int = 1) -> list[Job]:
     """All networks: sixteen, and those of Table 4 again with each further seed."""
     found = [Job(way, share) for way, share in WAYS.cells(PROTOCOL.shares) if way.network]
     ablated = [way for way in WAYS.table_4 if way.network]
-    return found + [Job(way, PROTOCOL.ablation_share, seed) for seed in range(1, seeds) for way in ablated]
+    return found + [
+        Job(way, PROTOCOL.ablation_share, seed) for seed in range(1, seeds) for way in ablated
+    ]
 
 
 def main(
@@ -99,8 +103,8 @@ def main(
         seconds: time of each network, in place of steps.
         in_all: the seconds are for all networks together.
         seeds: number of trainings of each network of Table 4.
-        shard: I/N trains every N-th network from the I-th on, so that N machines share the work; then bring the folders
-            together.
+        shard: I/N trains every N-th network from the I-th on, so that N machines share the work;
+            then bring the folders together.
     """
     part, slash, parts = shard.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
@@ -108,14 +112,17 @@ def main(
     every = jobs(seeds)
     if seconds is not None and in_all:
         seconds /= len(every)
-    chosen, own = TRAININGS[training], every[int(part) - 1 :: int(parts)]
+    chosen = TRAININGS[training]
+    own = every[int(part) - 1 :: int(parts)]
     options = chosen.options | ({} if size is None else {"pipeline.model.size": size})
     for number, job in enumerate(own, 1):
         folder = folder_of_run(output, job.name, chosen.method, "run")
         if (folder / RUN_FILES.refiner).is_file():  # written at the end of a training
             continue
         assert job.way.network is not None
-        needs = options | job.way.network.options(job.share) | {"pipeline.datamanager.seed": job.seed}
+        needs = (
+            options | job.way.network.options(job.share) | {"pipeline.datamanager.seed": job.seed}
+        )
         left = steps or chosen.steps
         try:
             left = max(1, left - open_run(folder, need_data=False).step - 1)
@@ -124,11 +131,15 @@ def main(
             shutil.rmtree(folder, ignore_errors=True)
         needs |= {"machine.seed": job.seed} | ({} if seconds is None else {"seconds": seconds})
         print(f"{number} of {len(own)}: {job.name}", flush=True)
-        command = train_refiner_command(scenes, output, job.name, left, "run", held_out, needs, chosen.method)
+        command = train_refiner_command(
+            scenes, output, job.name, left, "run", held_out, needs, chosen.method
+        )
         run(command, output / "logs" / f"{job.name}.txt")
     print(f"{output}: {len(own)} networks of {len(every)}")
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that the training is ended as well
+    signal.signal(
+        signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM)
+    )  # so that the training is ended as well
     start(main)

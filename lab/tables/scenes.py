@@ -25,7 +25,8 @@ from pointsplat_ns.views import Views
 
 @dataclass(frozen=True)
 class Options:
-    """What measurements depend on beside the scene. Raises PointSplatError if an option is below 1."""
+    """What measurements depend on beside the scene. Raises PointSplatError if an option is below
+    1."""
 
     views: int = 10
     """Largest number of held-out views of a scene."""
@@ -43,7 +44,8 @@ class Options:
 
     @property
     def training_views(self) -> int:
-        """Largest number of views for fine-tuning and scoring. Their photos are in memory, at first in full size."""
+        """Largest number of views for fine-tuning and scoring. Their photos are in memory, at first
+        in full size."""
         return max(60, self.scoring_views)
 
     @property
@@ -51,7 +53,11 @@ class Options:
         """The options that are not defaults, as words of the command."""
         usual = asdict(Options())
         changed = {name: value for name, value in asdict(self).items() if value != usual[name]}
-        return [word for name, value in changed.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+        return [
+            word
+            for name, value in changed.items()
+            for word in (f"--{name.replace('_', '-')}", str(value))
+        ]
 
 
 @dataclass(frozen=True)
@@ -62,13 +68,15 @@ class Pictures:
     photos: list[Tensor] | None = None
 
     def resized(self, side: int) -> Pictures:
-        """The same with at most ``side`` pixels on the longer side; photos are averaged over the areas of pixels."""
+        """The same with at most ``side`` pixels on the longer side; photos are averaged over the
+        areas of pixels."""
         views = self.views.resized(side)
         if self.photos is None or views is self.views:
             return Pictures(views, self.photos)
         size = (views.height, views.width)
         areas = (
-            torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size, mode="area") for photo in self.photos
+            torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size, mode="area")
+            for photo in self.photos
         )
         return Pictures(views, [photo[0].permute(1, 2, 0) for photo in areas])
 
@@ -92,27 +100,34 @@ class OpenedScene:
 
 
 def open_scene(path: Path, data: Path | None, options: Options) -> OpenedScene:
-    """Read a scene, its views, and its photos if there are any. Raises SceneError if no Gaussian can be drawn."""
+    """Read a scene, its views, and its photos if there are any. Raises SceneError if no Gaussian
+    can be drawn."""
     dense = read_scene(path)
     need_usable(dense)
     if may_be_run(path):
         try:
             whole = Pictures(*dataset_photos(path, "test", options.views, data))
             held_out = whole.resized(options.side)
-            training = Pictures(*dataset_photos(path, "train", options.training_views, data)).resized(options.side)
+            training = Pictures(
+                *dataset_photos(path, "train", options.training_views, data)
+            ).resized(options.side)
             size = held_out.views.width, whole.views.width
-            differs = differences(open_run(path, data=data), dense.sh_degree, len(held_out.views), size)
+            differs = differences(
+                open_run(path, data=data), dense.sh_degree, len(held_out.views), size
+            )
             return OpenedScene(path, data, dense, held_out, training, "held-out photos", differs)
         except (SceneError, DataError) as error:
             logger.warning("%s: no photos to compare with: %s", path, error)
     held_out = Pictures(ps.sample_views(dense, options.views, seed=1)).resized(options.side)
     training = Pictures(ps.sample_views(dense, options.training_views)).resized(options.side)
-    return OpenedScene(path, data, dense, held_out, training, "sampled views", ("no held-out photos",))
+    return OpenedScene(
+        path, data, dense, held_out, training, "sampled views", ("no held-out photos",)
+    )
 
 
 def differences(run: Run, sh_degree: int, seen: int, widths: tuple[int, int]) -> tuple[str, ...]:
-    """Differences of a scene's measurement from the paper's protocol: SH degree 3, 15,000 Splatfacto steps, judged by
-    all held-out photos in their full size.
+    """Differences of a scene's measurement from the paper's protocol: SH degree 3, 15,000
+    Splatfacto steps, judged by all held-out photos in their full size.
 
     Args:
         run: with its data.
@@ -140,10 +155,12 @@ def differences(run: Run, sh_degree: int, seen: int, widths: tuple[int, int]) ->
 
 
 def paper_dataset(run: Run) -> str:
-    """The dataset of the paper that a run, opened with its data, was trained on: "Replica" or "ScanNet++"; empty if it
-    is another, or its data is gone."""
-    parser, name = run.dataparser_class.rpartition(".")[2], run.data.name
-    # The scenes of NICE-SLAM's Replica, which the paper follows; it does not say which three it tests on.
+    """The dataset of the paper that a run, opened with its data, was trained on: "Replica" or
+    "ScanNet++"; empty if it is another, or its data is gone."""
+    parser = run.dataparser_class.rpartition(".")[2]
+    name = run.data.name
+    # The scenes of NICE-SLAM's Replica, which the paper follows; it does not say which three it
+    # tests on.
     if parser == "ReplicaDataParserConfig" and re.fullmatch(r"room[0-2]|office[0-4]", name):
         try:
             scene = load_replica(run.data)
@@ -153,10 +170,15 @@ def paper_dataset(run: Run) -> str:
         # The rooms that this package makes may have the same names, but not this size and number.
         return "Replica" if size == (1200, 680) and len(scene) == 2000 else ""
     # By the dataset's own files, or by the COLMAP model among them, as the paper's authors read it.
-    parsers = {"SeededScanNetppDataParserConfig", "ScanNetppDataParserConfig", "ColmapDataParserConfig"}
+    parsers = {
+        "SeededScanNetppDataParserConfig",
+        "ScanNetppDataParserConfig",
+        "ColmapDataParserConfig",
+    }
     folders = (run.data, *run.data.parents) if parser == "ColmapDataParserConfig" else (run.data,)
     if parser in parsers and any(
-        re.fullmatch(r"[0-9a-f]{10}", folder.name) and (folder / "dslr").is_dir() for folder in folders[:4]
+        re.fullmatch(r"[0-9a-f]{10}", folder.name) and (folder / "dslr").is_dir()
+        for folder in folders[:4]
     ):
         return "ScanNet++"
     return ""

@@ -1,5 +1,5 @@
-"""The rows of the tables: ways of making a scene smaller, by name; and the paper's figures (arXiv 2604.09903), for
-comparison on the same datasets only."""
+"""The rows of the tables: ways of making a scene smaller, by name; and the paper's figures (arXiv
+2604.09903), for comparison on the same datasets only."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class Protocol:
     figure_share: float = 0.5
     """Share of the Gaussians in Figures 3 and 4."""
     seed: int = 0
-    """Seed of the order of views in fine-tuning, and of random selection. No other step is random."""
+    """Seed of the order of views in fine-tuning, and of random selection. No other step is
+    random."""
 
 
 PROTOCOL = Protocol()
@@ -52,9 +53,12 @@ class Network:
         return f"{words}, trained on scenes pruned by {self.by}{weight}"
 
     def options(self, share: float) -> dict[str, str]:
-        """The options of ``ns-train pointsplat`` that make such a network for a share of the Gaussians."""
+        """The options of ``ns-train pointsplat`` that make such a network for a share of the
+        Gaussians."""
         options = {"encoder": self.encoder, "by": self.by, "keep": f"{share:g}"}
-        options |= {} if self.opacity_weight is None else {"opacity-weight": f"{self.opacity_weight:g}"}
+        options |= (
+            {} if self.opacity_weight is None else {"opacity-weight": f"{self.opacity_weight:g}"}
+        )
         options |= {} if self.use_appearance else {"use-appearance": "False"}
         options |= {} if self.use_position else {"use-position": "False"}
         return {f"pipeline.model.{name}": value for name, value in options.items()}
@@ -64,7 +68,8 @@ class Network:
 
         Example:
             >>> Network("concat", "random", None).command(0.3)
-            'ns-train pointsplat --data SCENES --pipeline.model.encoder concat --pipeline.model.by random \
+            'ns-train pointsplat --data SCENES --pipeline.model.encoder concat --pipeline.model.by
+            random \
 --pipeline.model.keep 0.3'
         """
         words = " ".join(f"--{name} {value}" for name, value in self.options(share).items())
@@ -95,21 +100,29 @@ class Way:
 
 @dataclass(frozen=True)
 class Ways:
-    """All ways, and the rows that the tables have of them. A star in a label marks ways without fine-tuning."""
+    """All ways, and the rows that the tables have of them. A star in a label marks ways without
+    fine-tuning."""
 
     dense: Way = Way("dense", "3DGS (dense)")
 
     # The paper's, by images of the scene.
     lightgaussian: Way = Way("lightgaussian", "LightGaussian*", "lightgaussian")
-    lightgaussian_tuned: Way = Way("lightgaussian-tuned", "LightGaussian", "lightgaussian", fine_tuned=True)
+    lightgaussian_tuned: Way = Way(
+        "lightgaussian-tuned", "LightGaussian", "lightgaussian", fine_tuned=True
+    )
     pup: Way = Way("pup", "PUP-3DGS*", "pup")
     pup_tuned: Way = Way("pup-tuned", "PUP-3DGS", "pup", fine_tuned=True)
 
     # The paper's, by the Gaussians alone.
-    splatformer: Way = Way("splatformer", "SplatFormer", "random", network=Network("concat", "random", None))
-    """The paper does not say how the Gaussians of this row are selected; not by its own score, which "boosts" it."""
+    splatformer: Way = Way(
+        "splatformer", "SplatFormer", "random", network=Network("concat", "random", None)
+    )
+    """The paper does not say how the Gaussians of this row are selected; not by its own score,
+    which "boosts" it."""
     paper: Way = Way("paper", "PointSplat*", "paper")
-    paper_splatformer: Way = Way("paper-splatformer", "PointSplat* + SplatFormer", "paper", network=Network("concat"))
+    paper_splatformer: Way = Way(
+        "paper-splatformer", "PointSplat* + SplatFormer", "paper", network=Network("concat")
+    )
     pointsplat: Way = Way("pointsplat", "PointSplat", "paper", network=Network())
 
     # The defaults of this package's commands.
@@ -118,7 +131,9 @@ class Ways:
 
     # The modes of another program.
     splat_transform: Way = Way("splat-transform", "splat-transform", mode=0)
-    splat_transform_adaptive: Way = Way("splat-transform-adaptive", "splat-transform, adaptive", mode=1)
+    splat_transform_adaptive: Way = Way(
+        "splat-transform-adaptive", "splat-transform, adaptive", mode=1
+    )
 
     @property
     def table_1(self) -> tuple[Way, ...]:
@@ -136,11 +151,18 @@ class Ways:
         """Lambda and way of each row of Table 3: the paper's selection, and refined."""
         found: list[tuple[float, Way]] = []
         for weight in PROTOCOL.opacity_weights:
-            selected, refined = self.paper, self.pointsplat
+            selected = self.paper
+            refined = self.pointsplat
             if weight != DEFAULT_OPACITY_WEIGHT:
                 network = Network(opacity_weight=weight)
                 selected = Way(f"paper-{weight:g}", self.paper.label, "paper", weight)
-                refined = Way(f"pointsplat-{weight:g}", self.pointsplat.label, "paper", weight, network=network)
+                refined = Way(
+                    f"pointsplat-{weight:g}",
+                    self.pointsplat.label,
+                    "paper",
+                    weight,
+                    network=network,
+                )
             found += [(weight, selected), (weight, refined)]
         return tuple(found)
 
@@ -149,7 +171,12 @@ class Ways:
         """Rows I to V of Table 4."""
         parts = {"ii": (False, False), "iii": (False, True), "iv": (True, False)}
         ablated = (
-            Way(f"pointsplat-{row}", row.upper(), "paper", network=Network(use_appearance=first, use_position=second))
+            Way(
+                f"pointsplat-{row}",
+                row.upper(),
+                "paper",
+                network=Network(use_appearance=first, use_position=second),
+            )
             for row, (first, second) in parts.items()
         )
         return (self.paper, *ablated, self.pointsplat)
@@ -160,12 +187,14 @@ class Ways:
         return (self.dense, self.lightgaussian, self.pup, self.paper, self.merge)
 
     def cells(self, shares: Sequence[float]) -> list[tuple[Way, float]]:
-        """Every way and share of all tables, those of Table 1 given, each once, in the order of measurement: quick ones
-        first."""
+        """Every way and share of all tables, those of Table 1 given, each once, in the order of
+        measurement: quick ones first."""
         ablations = dict.fromkeys([*(way for _, way in self.table_3), *self.table_4])
         cells = [(self.dense, 1.0), *((way, PROTOCOL.ablation_share) for way in ablations)]
         quick = (*self._by_gaussians, self.merge, self.compact)
-        cells += [(way, share) for way in dict.fromkeys([*quick, *self.table_1]) for share in shares]
+        cells += [
+            (way, share) for way in dict.fromkeys([*quick, *self.table_1]) for share in shares
+        ]
         return list(dict.fromkeys(cells))
 
     @property
@@ -221,7 +250,14 @@ _PUBLISHED: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
     3: {
         ("paper-0.1", 0.1): (20.52, 0.824, 0.411, 22.42, 0.846, 0.364),
         ("pointsplat-0.1", 0.1): (21.72, 0.837, 0.406, 28.23, 0.881, 0.281),
-        ("paper", 0.1): (21.87, 0.836, 0.377, 17.60, 0.802, 0.397),  # Table 1 has 21.88 and 0.838 on ScanNet++
+        ("paper", 0.1): (
+            21.87,
+            0.836,
+            0.377,
+            17.60,
+            0.802,
+            0.397,
+        ),  # Table 1 has 21.88 and 0.838 on ScanNet++
         ("pointsplat", 0.1): (23.46, 0.855, 0.374, 29.81, 0.902, 0.276),
         ("paper-0.5", 0.1): (20.57, 0.813, 0.402, 15.45, 0.752, 0.433),
         ("pointsplat-0.5", 0.1): (22.72, 0.846, 0.376, 27.71, 0.888, 0.274),
@@ -241,9 +277,11 @@ _PUBLISHED: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
 """PSNR (dB), SSIM and LPIPS on ScanNet++, then on Replica, by table, way and share."""
 
 
-def published(table: int, dataset: str, way: str, share: float) -> tuple[float, float, float] | None:
-    """The paper's PSNR (dB), SSIM and LPIPS of a row, by its way and share, against held-out photos in table 1, 3 or 4;
-    None if there are none.
+def published(
+    table: int, dataset: str, way: str, share: float
+) -> tuple[float, float, float] | None:
+    """The paper's PSNR (dB), SSIM and LPIPS of a row, by its way and share, against held-out photos
+    in table 1, 3 or 4; None if there are none.
 
     Example:
         >>> published(1, "Replica", "pointsplat", 0.1)

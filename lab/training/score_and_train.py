@@ -58,7 +58,10 @@ def main(
     pruned = prune_scene(dense, PruneRequest(keep, by), views).scene
     budget = CpuBudget(cpu_seconds=seconds, started=time.process_time())
     trained = photo_repair(pruned, dense, run_photos(run), views, budget)
-    print(f"{trained.steps} steps: {trained.before:.2f} -> {trained.after:.2f} dB in {trained.compared} photos")
+    print(
+        f"{trained.steps} steps: {trained.before:.2f} -> {trained.after:.2f} dB in "
+        f"{trained.compared} photos"
+    )
     ps.save(trained.scene, output, overwrite=True)
 
 

@@ -1,14 +1,16 @@
-"""Who has the photos: which way to a small scene is best at an equal number of Gaussians and equal CPU seconds?
+"""Who has the photos: which way to a small scene is best at an equal number of Gaussians and equal
+CPU seconds?
 
     python -m lab.training.with_photos fox --steps 2000 --keep 0.1 0.3 --json with_photos.json \\
         --train "splatfacto-cpu --data scannetpp/fox scannetpp-seeded"
     python -m lab.training.with_photos --write with_photos.json      # docs/record/with_photos.md
 
-A dense scene is trained by ``ns-train splatfacto-cpu``, and made smaller by each way. The results are compared with the
-held-out photos, at the size of the photos. Each way is a process of its own, whose CPU seconds count, with starting and
-reading. Training on photos after pruning by a score takes as long as ``compact --photos``. A long ``compact --photos``
-trains on photos for as many seconds of the clock as the dense training took of the processor. Finished rows are not
-measured again.
+A dense scene is trained by ``ns-train splatfacto-cpu``, and made smaller by each way. The results
+are compared with the held-out photos, at the size of the photos. Each way is a process of its own,
+whose CPU seconds count, with starting and reading. Training on photos after pruning by a score
+takes as long as ``compact --photos``. A long ``compact --photos`` trains on photos for as many
+seconds of the clock as the dense training took of the processor. Finished rows are not measured
+again.
 """
 
 from __future__ import annotations
@@ -43,8 +45,10 @@ from pointsplat_ns.rasterizer import render
 DENSE = "dense"
 """Name of the dense scene."""
 
-COMPACTED, COMPACTED_LONG = "compact --photos", "compact --photos, long"
-"""The way that says how many seconds the others get; and the same with as many seconds as the dense training took."""
+COMPACTED = "compact --photos"
+COMPACTED_LONG = "compact --photos, long"
+"""The way that says how many seconds the others get; and the same with as many seconds as the dense
+training took."""
 
 WAYS: dict[str, list[str]] = {
     "prune": ["prune"],
@@ -71,7 +75,10 @@ PAGE = f"""# With the photos at hand
   seconds as that takes in all. Their scoring comes on top. Their own schedules are longer.
 """
 
-LONG = f'- "{COMPACTED_LONG}" takes `--seconds` of the CPU seconds of the dense training: about half as many.'
+LONG = (
+    f'- "{COMPACTED_LONG}" takes `--seconds` of the CPU seconds of the dense training: about half '
+    "as many."
+)
 
 FIGURES = {"cpu_seconds": ",.0f", "psnr": ".2f", "lpips": ".3f"}
 """Figures of a way at one budget, with their formats."""
@@ -92,8 +99,14 @@ class Capture:
         lpips: the network of LPIPS, if there is one.
     """
 
-    def __init__(self, name: str, arguments: list[str], steps: int, folder: Path, lpips: Lpips | None):
-        self.name, self.arguments, self.steps, self.folder, self.lpips = name, arguments, steps, folder, lpips
+    def __init__(
+        self, name: str, arguments: list[str], steps: int, folder: Path, lpips: Lpips | None
+    ):
+        self.name = name
+        self.arguments = arguments
+        self.steps = steps
+        self.folder = folder
+        self.lpips = lpips
 
     @property
     def dense(self) -> Path:
@@ -103,8 +116,22 @@ class Capture:
     def train(self) -> tuple[Path, float]:
         """A new dense training: its run and its CPU seconds."""
         shutil.rmtree(self.dense, ignore_errors=True)
-        words = [*_TRAIN, self.arguments[0], "--output-dir", str(self.folder), "--experiment-name", self.name]
-        words += ["--timestamp", "dense", "--max-num-iterations", str(self.steps), "--vis", "tensorboard"]
+        words = [
+            *_TRAIN,
+            self.arguments[0],
+            "--output-dir",
+            str(self.folder),
+            "--experiment-name",
+            self.name,
+        ]
+        words += [
+            "--timestamp",
+            "dense",
+            "--max-num-iterations",
+            str(self.steps),
+            "--vis",
+            "tensorboard",
+        ]
         words += ["--steps-per-eval-image", "0", "--steps-per-save", str(self.steps)]
         return self.dense, _cpu_seconds([*words, *self.arguments[1:]])
 
@@ -120,7 +147,10 @@ class Capture:
         """The row of a result: a file or a run."""
         small = read_scene(scene)
         _, views, photos = photos_of(self.dense, "test", sys.maxsize)
-        found = [metrics_of(render(small, view), photo, self.lpips) for view, photo in zip(views, photos, strict=True)]
+        found = [
+            metrics_of(render(small, view), photo, self.lpips)
+            for view, photo in zip(views, photos, strict=True)
+        ]
         means = {name: round(fmean(metrics[name] for metrics in found), 4) for name in found[0]}
         about: Row = {
             "scene": self.name,
@@ -134,7 +164,9 @@ class Capture:
         return about | {"cpu_seconds": round(seconds, 1), "needs_dense": with_dense} | means
 
 
-def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row], long: bool = True) -> Iterator[Row]:
+def measured(
+    capture: Capture, keeps: tuple[float, ...], known: list[Row], long: bool = True
+) -> Iterator[Row]:
     """The rows that are missing, of the long training only if it is asked for."""
     there = {(row["keep"], row["method"]): row for row in known}
     if (1.0, DENSE) not in there:
@@ -151,7 +183,12 @@ def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row], long:
                 yield there[keep, method]
         if long and (keep, COMPACTED_LONG) not in there:
             command, *options = *WAYS[COMPACTED], "--seconds", f"{dense['cpu_seconds']:.0f}"
-            yield capture.row(keep, COMPACTED_LONG, *capture.reduced([*_POINTSPLAT, command], count, options), True)
+            yield capture.row(
+                keep,
+                COMPACTED_LONG,
+                *capture.reduced([*_POINTSPLAT, command], count, options),
+                True,
+            )
         seconds = there[keep, COMPACTED]["cpu_seconds"]
         for by, method in SCORES.items():
             if (keep, method) not in there:
@@ -166,10 +203,15 @@ def _cpu_seconds(words: list[str]) -> float:
 
 def page(rows: list[Row]) -> str:
     """The page of all tables."""
-    parts = [PAGE.strip() + (f"\n{LONG}" if any(row["method"] == COMPACTED_LONG for row in rows) else "")]
+    parts = [
+        PAGE.strip() + (f"\n{LONG}" if any(row["method"] == COMPACTED_LONG for row in rows) else "")
+    ]
     leads = lead_table(rows)
     if leads:
-        parts.append(f"## Lead of `{COMPACTED}`\n\nPSNR in dB above each way, mean (smallest…largest):\n\n{leads}")
+        parts.append(
+            f"## Lead of `{COMPACTED}`\n\nPSNR in dB above each way, mean "
+            f"(smallest…largest):\n\n{leads}"
+        )
     for scene, same in sorted(grouped(rows, lambda row: row["scene"]).items()):
         dense = next(row for row in same if row["method"] == DENSE)
         about = f"Dense: {dense['count']:,} Gaussians, {_cell(dense)}"
@@ -193,7 +235,8 @@ def _cell(row: Row) -> str:
 
 
 def lead_table(rows: list[Row]) -> str:
-    """How much better ``compact --photos`` is than each way, over captures; empty if it has no row."""
+    """How much better ``compact --photos`` is than each way, over captures; empty if it has no
+    row."""
     psnr = pd.DataFrame(rows).pivot_table(index=["keep", "scene"], columns="method", values="psnr")
     dense = {scene: value for (keep, scene), value in psnr[DENSE].dropna().items()}
     psnr[DENSE] = psnr.index.get_level_values("scene").map(dense)
@@ -204,7 +247,10 @@ def lead_table(rows: list[Row]) -> str:
     lines = []
     for method in (method for method in METHODS if method in leads):
         found = [leads.loc[keep, method].dropna() for keep in keeps]
-        spans = [f"{f.mean():+.2f} ({f.min():+.2f}…{f.max():+.2f}), {len(f)}" if len(f) else "-" for f in found]
+        spans = [
+            f"{f.mean():+.2f} ({f.min():+.2f}…{f.max():+.2f}), {len(f)}" if len(f) else "-"
+            for f in found
+        ]
         lines += [[method, *spans]] if any(map(len, found)) else []
     return markdown(["over", *(f"{percent(keep)}, captures" for keep in keeps)], lines)
 
@@ -259,7 +305,10 @@ def main(
         raise SystemExit(f"--train {train}; expected it to begin with {METHOD_NAMES.scene}")
     capture = Capture(name, arguments, steps, folder.resolve(), lpips)
     if results.of(name) and not capture.dense.is_dir():
-        raise SystemExit(f"{json_path} has rows of {name}, but {capture.dense} is missing; expected the same --folder")
+        raise SystemExit(
+            f"{json_path} has rows of {name}, but {capture.dense} is missing; expected the same "
+            "--folder"
+        )
     for row in measured(capture, keep, results.of(name), long):
         results.put(name, [*results.of(name), row])
         print(row, flush=True)

@@ -20,20 +20,37 @@ from typing import Any, NoReturn, TextIO, cast
 
 from pointsplat_ns.errors import PointSplatError, printable
 
-COMMANDS = ("prune", "compact", "clean", "lod", "tradeoff", "convert", "info", "view", "render", "export", "demo")
-"""The commands. Each is a function in a module of the same name, which is imported when the command runs."""
+COMMANDS = (
+    "prune",
+    "compact",
+    "clean",
+    "lod",
+    "tradeoff",
+    "convert",
+    "info",
+    "view",
+    "render",
+    "export",
+    "demo",
+)
+"""The commands. Each is a function in a module of the same name, which is imported when the command
+runs."""
 
 
 class _Shown:
-    """A text stream that shows control characters, such as those in the name of a file, instead of sending them."""
+    """A text stream that shows control characters, such as those in the name of a file, instead of
+    sending them."""
 
     def __init__(self, stream: TextIO):
         self._stream = stream
 
     def write(self, text: str) -> int:
-        # Colours and the moves of progress bars, which are ours; then any other control characters, which are not.
+        # Colours and the moves of progress bars, which are ours; then any other control characters,
+        # which are not.
         steering = r"\x1b\[(?:[\d;]*m|\?25[lh]|\d*[AK])|[^\t\n\r\x20-\x7e\xa0-\U0010ffff]+"
-        self._stream.write(re.sub(steering, lambda m: m[0] if m[0].startswith("\x1b[") else printable(m[0]), text))
+        self._stream.write(
+            re.sub(steering, lambda m: m[0] if m[0].startswith("\x1b[") else printable(m[0]), text)
+        )
         return len(text)
 
     def __getattr__(self, name: str) -> Any:
@@ -44,8 +61,9 @@ class _Shown:
 def any_text_printable() -> Iterator[None]:
     """Let standard output and standard error take any text while the context is open.
 
-    Streams that are closed go nowhere. Characters that an encoding lacks are replaced. Control characters are shown as
-    Python writes them, such as ``\\x1b``; only colours and progress bars reach a terminal.
+    Streams that are closed go nowhere. Characters that an encoding lacks are replaced. Control
+    characters are shown as Python writes them, such as ``\\x1b``; only colours and progress bars
+    reach a terminal.
     """
     for number in (0, 1, 2):
         try:
@@ -78,26 +96,34 @@ class _PrintHandler(logging.Handler):
 def _log_printed(level_printed: int) -> Iterator[None]:
     """Print the package's log, from a level on, while the context is open."""
     logger = logging.getLogger("pointsplat_ns")
-    handlers, propagate, level = logger.handlers, logger.propagate, logger.level
-    logger.handlers, logger.propagate = [_PrintHandler()], False
+    handlers = logger.handlers
+    propagate = logger.propagate
+    level = logger.level
+    logger.handlers = [_PrintHandler()]
+    logger.propagate = False
     logger.setLevel(level_printed)
     try:
         yield
     finally:
-        logger.handlers, logger.propagate = handlers, propagate
+        logger.handlers = handlers
+        logger.propagate = propagate
         logger.setLevel(level)
 
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Let a lost terminal (SIGHUP) and a termination request (SIGTERM) unwind the program as Ctrl-C does instead of
-    killing it, so that unfinished files are removed and workers stopped."""
+    """Let a lost terminal (SIGHUP) and a termination request (SIGTERM) unwind the program as Ctrl-C
+    does instead of killing it, so that unfinished files are removed and workers stopped."""
 
     def end(number: int, frame: Any) -> None:
         sys.exit(128 + number)
 
-    numbers = [getattr(signal, name) for name in ("SIGHUP", "SIGTERM") if hasattr(signal, name)]  # none on Windows
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
+    numbers = [
+        getattr(signal, name) for name in ("SIGHUP", "SIGTERM") if hasattr(signal, name)
+    ]  # none on Windows
+    if (
+        threading.current_thread() is not threading.main_thread()
+    ):  # only the main thread may set handlers
         numbers = []
     before = {n: signal.signal(n, end) for n in numbers if signal.getsignal(n) is signal.SIG_DFL}
     try:
@@ -125,8 +151,9 @@ def _what_failed(error: Exception) -> str:
 
 
 def _is_bug(error: Exception) -> bool:
-    """Whether an error is none of the input or of the machine: a module of ours that is missing, a name that a module
-    lacks, or a RuntimeError other than of torch's memory, which has no type of its own on a CPU."""
+    """Whether an error is none of the input or of the machine: a module of ours that is missing, a
+    name that a module lacks, or a RuntimeError other than of torch's memory, which has no type of
+    its own on a CPU."""
     if isinstance(error, ModuleNotFoundError):
         return error.name is None or error.name.startswith(__package__.partition(".")[0])
     if isinstance(error, ImportError):
@@ -135,12 +162,15 @@ def _is_bug(error: Exception) -> bool:
         return False
     import torch
 
-    return not isinstance(error, torch.cuda.OutOfMemoryError) and "can't allocate memory" not in str(error)
+    return not isinstance(
+        error, torch.cuda.OutOfMemoryError
+    ) and "can't allocate memory" not in str(error)
 
 
 def _ignore_matplotlibrc() -> None:
-    """Keep matplotlib from obeying a file ``matplotlibrc`` in the current folder, which may be a stranger's, before the
-    user's own. It looks for one when it is imported, so that is done elsewhere."""
+    """Keep matplotlib from obeying a file ``matplotlibrc`` in the current folder, which may be a
+    stranger's, before the user's own. It looks for one when it is imported, so that is done
+    elsewhere."""
     if not os.path.lexists("matplotlibrc"):
         return
     here = os.getcwd()
@@ -152,21 +182,28 @@ def _ignore_matplotlibrc() -> None:
 
 
 def _command(name: str, short: bool = False) -> Callable[..., None]:
-    """The function of a command, in the module of the same name, with each option of its docstring on one line, as
-    tyro's help and its completion in bash want it; if ``short``, with the first sentence alone. It is a copy, because
-    tyro unwraps wrappers."""
+    """The function of a command, in the module of the same name, with each option of its docstring
+    on one line, as tyro's help and its completion in bash want it; if ``short``, with the first
+    sentence alone. It is a copy, because tyro unwraps wrappers."""
     command: Any = getattr(importlib.import_module(f"{__package__}.{name}"), name)
-    same = types.FunctionType(command.__code__, command.__globals__, command.__name__, command.__defaults__)
-    same.__annotations__, same.__kwdefaults__ = command.__annotations__, command.__kwdefaults__
+    same = types.FunctionType(
+        command.__code__, command.__globals__, command.__name__, command.__defaults__
+    )
+    same.__annotations__ = command.__annotations__
+    same.__kwdefaults__ = command.__kwdefaults__
     text = inspect.getdoc(command) or ""
-    same.__doc__ = re.split(r"(?<=\.)\s", text, maxsplit=1)[0] if short else re.sub(r"\n {8,}", " ", text)
+    same.__doc__ = (
+        re.split(r"(?<=\.)\s", text, maxsplit=1)[0] if short else re.sub(r"\n {8,}", " ", text)
+    )
     return same
 
 
 def program() -> NoReturn:
-    """The program ``pointsplat``: :func:`main`, then the end of the process with status 0, without unloading torch's
-    libraries, which takes 0.4 CPU seconds."""
-    gc.set_threshold(100_000)  # searching the objects of torch's modules for garbage takes 0.2 s by default
+    """The program ``pointsplat``: :func:`main`, then the end of the process with status 0, without
+    unloading torch's libraries, which takes 0.4 CPU seconds."""
+    gc.set_threshold(
+        100_000
+    )  # searching the objects of torch's modules for garbage takes 0.2 s by default
     main()
     atexit._run_exitfuncs()
     for stream in filter(None, (sys.stdout, sys.stderr)):
@@ -177,24 +214,29 @@ def program() -> NoReturn:
 def main(args: list[str] | None = None) -> None:
     """Run one subcommand; by default that of the program's own arguments.
 
-    Unusable input, files that cannot be read or written, a lack of memory and a missing package end it with one line
-    and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its number. With ``--json``, standard
-    output has one JSON value and nothing else.
+    Unusable input, files that cannot be read or written, a lack of memory and a missing package end
+    it with one line and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its
+    number. With ``--json``, standard output has one JSON value and nothing else.
     """
     with any_text_printable():
         try:
             _run(sys.argv[1:] if args is None else args)
         except PointSplatError as error:
-            text, status = f"error: {error}", 1
+            text = f"error: {error}"
+            status = 1
         except BrokenPipeError:  # of `pointsplat ... | head`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what it did not take is not tried again
+            os.dup2(
+                os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+            )  # what it did not take is not tried again
             sys.exit(1)
         except (ImportError, OSError, MemoryError, RuntimeError) as error:
             if _is_bug(error):
                 raise
-            text, status = f"error: {printable(_what_failed(error))}", 1
+            text = f"error: {printable(_what_failed(error))}"
+            status = 1
         except KeyboardInterrupt:
-            text, status = "interrupted", 130
+            text = "interrupted"
+            status = 130
         else:
             return
         print(text, file=sys.stderr)
@@ -223,8 +265,12 @@ def _run(args: list[str]) -> None:
             else:
                 about = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them."
                 about += " `--version` prints the version."
-                commands = {name: _command(name, short=args in (["-h"], ["--help"])) for name in COMMANDS}
-                tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", description=about, args=args)
+                commands = {
+                    name: _command(name, short=args in (["-h"], ["--help"])) for name in COMMANDS
+                }
+                tyro.extras.subcommand_cli_from_dict(
+                    commands, prog="pointsplat", description=about, args=args
+                )
     except SystemExit as end:
         if not end.code and (text := after_help(args)):
             print(f"\n{text}")

@@ -25,10 +25,10 @@ def clean(
     Args:
         output: file to write: .ply, .spz, .sog, .splat; by default in the format of the scene and
             beside it: room_clean.ply for room.ply.
-        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
-            hardly change. 0 removes only what cannot be drawn or seen.
-        picture: a .png file that shows, in three views, the scene, what goes in a colour for each cluster, and the
-            result; by default none.
+        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show,
+            without which pictures hardly change. 0 removes only what cannot be drawn or seen.
+        picture: a .png file that shows, in three views, the scene, what goes in a colour for each
+            cluster, and the result; by default none.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -45,7 +45,9 @@ def clean(
     quality = quality_of_file(judge_of(dense, source), cleaned, output)
     if json_output:
         compared = quality.as_dict() if quality else {"psnr": None}
-        print_json({**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture})
+        print_json(
+            {**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture}
+        )
         return
     print_result("clean", [], len(dense), cleaned, seconds, output, quality)
     if picture is not None:

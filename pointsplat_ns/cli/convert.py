@@ -26,14 +26,15 @@ def convert(
     """Write a scene in another format. What formats lose stands in docs/formats.md.
 
     Args:
-        scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat), a Splatfacto
-            checkpoint, or a run (its folder or config.yml).
+        scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat), a
+            Splatfacto checkpoint, or a run (its folder or config.yml).
         output: the file to write; its name says the format: .ply, .spz, .sog or .splat.
         sh: SH bands to keep: all, or up to a degree.
-        up: the new up axis: x, y, z, -x, -y or -z. By default nothing is turned. The old up direction is estimated;
-            -y:z names it as -y. Write --up=-y for a negative axis.
+        up: the new up axis: x, y, z, -x, -y or -z. By default nothing is turned. The old up
+            direction is estimated; -y:z names it as -y. Write --up=-y for a negative axis.
         scale: factor on positions and sizes.
-        original_frame: for a Splatfacto run: undo nerfstudio's rotation, shift and scale of its data.
+        original_frame: for a Splatfacto run: undo nerfstudio's rotation, shift and scale of its
+            data.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -41,7 +42,8 @@ def convert(
 
     options.need_one_scene(scene)
     options.check_outputs(output, force)
-    start, there = time.perf_counter(), output.parent.exists()
+    start = time.perf_counter()
+    there = output.parent.exists()
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))
     after = ps.place(after, up, scale, scene if original_frame else None)
@@ -53,4 +55,7 @@ def convert(
     cut = f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
     degree = f"SH degree {before.sh_degree}{cut}"
     made = "" if there else ", in a new folder"
-    print(f"{output}: {len(after):,} Gaussians, {degree}, {written_size(output)}, in {seconds_text(seconds)}{made}")
+    print(
+        f"{output}: {len(after):,} Gaussians, {degree}, {written_size(output)}, in "
+        f"{seconds_text(seconds)}{made}"
+    )

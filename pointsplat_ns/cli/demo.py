@@ -16,7 +16,8 @@ def demo(output: options.Output = None, force: options.Force = False) -> None:
     """
     import pointsplat_ns as ps
 
-    path, scene = output or Path("room.ply"), ps.example_room()
+    path = output or Path("room.ply")
+    scene = ps.example_room()
     options.check_outputs(path, force)
     ps.save(scene, path, overwrite=True)
     print(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")

@@ -21,13 +21,16 @@ def export(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Write the refined scene of a pointsplat run, or the trained one of a Splatfacto run, as a file of any format.
+    """Write the refined scene of a pointsplat run, or the trained one of a Splatfacto run, as a
+    file of any format.
 
     Args:
         run: the run's folder, config.yml or checkpoint.
         output: the file to write, of any format as for prune.
-        scene: name of a scene of a pointsplat run; by default the first held-out one, or else the first.
-        data: folder of the scenes of a pointsplat run, or one above it, if they are no longer where the run says.
+        scene: name of a scene of a pointsplat run; by default the first held-out one, or else the
+            first.
+        data: folder of the scenes of a pointsplat run, or one above it, if they are no longer where
+            the run says.
     """
     options.need_scenes(run)
     import pointsplat_ns as ps
@@ -40,4 +43,6 @@ def export(
     if json_output:
         print_json(scene_result(None, exported, seconds, output))
         return
-    print(f"{output}: {len(exported):,} Gaussians, {written_size(output)}, in {seconds_text(seconds)}")
+    print(
+        f"{output}: {len(exported):,} Gaussians, {written_size(output)}, in {seconds_text(seconds)}"
+    )

@@ -1,13 +1,25 @@
-"""Text of ``--help`` after the options: examples of every command, and meanings of exit statuses."""
+"""Text of ``--help`` after the options: examples of every command, and meanings of exit
+statuses."""
 
 from __future__ import annotations
 
 EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
-    "prune": (("a tenth of the Gaussians, to room_pruned.ply", "pointsplat prune room.ply --keep 10%"),),
+    "prune": (
+        ("a tenth of the Gaussians, to room_pruned.ply", "pointsplat prune room.ply --keep 10%"),
+    ),
     "compact": (
-        ("a tenth, repaired, and a page to compare", "pointsplat compact room.ply --keep 10% --html small.html"),
-        ("with the photos and their COLMAP model", "pointsplat compact room.ply --photos images --poses sparse/0"),
-        ("every scene of a folder, and a gallery", "pointsplat compact rooms --keep 10% --jobs 4 --html all.html"),
+        (
+            "a tenth, repaired, and a page to compare",
+            "pointsplat compact room.ply --keep 10% --html small.html",
+        ),
+        (
+            "with the photos and their COLMAP model",
+            "pointsplat compact room.ply --photos images --poses sparse/0",
+        ),
+        (
+            "every scene of a folder, and a gallery",
+            "pointsplat compact rooms --keep 10% --jobs 4 --html all.html",
+        ),
     ),
     "clean": (
         ("what floats or is hidden goes, to room_clean.ply", "pointsplat clean room.ply"),
@@ -34,7 +46,9 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("a film", "pointsplat render room.ply -o room.mp4"),
         ("two scenes side by side", "pointsplat render room.ply room_pruned.ply -o both.mp4"),
     ),
-    "export": (("the scene of a run", "pointsplat export outputs/room/splatfacto-cpu/RUN -o room.ply"),),
+    "export": (
+        ("the scene of a run", "pointsplat export outputs/room/splatfacto-cpu/RUN -o room.ply"),
+    ),
     "demo": (("a scene to try commands with: room.ply", "pointsplat demo"),),
 }
 """Command lines of every command, with the purpose of each."""
@@ -45,7 +59,9 @@ def after_help(args: list[str]) -> str:
     if not {"-h", "--help"} & {*args}:
         return ""
     if args[0] in EXAMPLES:
-        lines = [line for what, command in EXAMPLES[args[0]] for line in (f"  # {what}", f"  {command}")]
+        lines = [
+            line for what, command in EXAMPLES[args[0]] for line in (f"  # {what}", f"  {command}")
+        ]
         return "\n".join(["examples:", *lines])
     return """exit status:
   0    done

@@ -25,14 +25,16 @@ def info(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, and rows that look wrong.
-    Several, and all scenes of a folder, make a table.
+    """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, and rows
+    that look wrong. Several, and all scenes of a folder, make a table.
 
     Args:
-        scenes: files of any format, checkpoints, runs (their folder or config.yml), or folders of scenes.
-        views: a .png file for a sheet of the views that other commands use without --poses, for one scene; by default
-            none.
-        json_output: print JSON, and nothing else on standard output: an object, or a list for several scenes.
+        scenes: files of any format, checkpoints, runs (their folder or config.yml), or folders of
+            scenes.
+        views: a .png file for a sheet of the views that other commands use without --poses, for one
+            scene; by default none.
+        json_output: print JSON, and nothing else on standard output: an object, or a list for
+            several scenes.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.errors import PointSplatError
@@ -42,7 +44,9 @@ def info(
     options.check_outputs(None, force, views)
     scenes = tuple(path for scene in scenes for path in _scenes_of(scene))
     if not scenes or (views is not None and len(scenes) > 1):
-        raise PointSplatError(f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}")
+        raise PointSplatError(
+            f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}"
+        )
     found: list[SceneInfo] = []
     failed: list[dict[str, str]] = []
     for scene in scenes:
@@ -53,7 +57,11 @@ def info(
                 raise
             print(f"error: {error}", file=sys.stderr)
             failed.append({"file": str(scene), "error": str(error)})
-    sheet = None if views is None else ps.plot_views(scenes[0], views, resolution=resolution, up=up, data=data)
+    sheet = (
+        None
+        if views is None
+        else ps.plot_views(scenes[0], views, resolution=resolution, up=up, data=data)
+    )
     if json_output:
         rows = [*(one.as_dict() for one in found), *failed]
         print_json(rows if len(rows) > 1 else rows[0])
@@ -82,10 +90,18 @@ def _print_table(found: list[SceneInfo]) -> None:
 
     rows = []
     for one in found:
-        rows.append([
-            one.file, one.format, three_digits(one.bytes / 1e6), f"{one.gaussians:,}", f"{one.sh_degree}", one.up_text,
-            "-" if one.fill is None else f"{one.fill:.1f}", f"{sum(one.suspicious.values()):,}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                one.file,
+                one.format,
+                three_digits(one.bytes / 1e6),
+                f"{one.gaussians:,}",
+                f"{one.sh_degree}",
+                one.up_text,
+                "-" if one.fill is None else f"{one.fill:.1f}",
+                f"{sum(one.suspicious.values()):,}",
+            ]
+        )
     header = ["file", "format", "MB", "Gaussians", "SH", "up", "fill", "suspicious"]
     print_table(header, rows, "fill: Gaussians drawn per pixel", left=(0, 1, 5))
 
@@ -94,14 +110,19 @@ def _print(found: SceneInfo) -> None:
     from pointsplat_ns.io.files import bytes_text
 
     print(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
-    print(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}{', antialiased' if found.antialiased else ''}")
+    print(
+        f"{found.gaussians:,} Gaussians of SH degree "
+        f"{found.sh_degree}{', antialiased' if found.antialiased else ''}"
+    )
     if found.offset:
         print(f"positions are relative to {' '.join(map(repr, found.offset))}")
     print(f"up: {found.up_text}{'; --up names another axis' if found.up_is_guess else ''}")
     if found.fill is not None:
         print(f"fill: {found.fill:.1f} Gaussians drawn per pixel, in {found.views}")
     if found.sh_energies:
-        root = ", ".join(f"degree {index + 1}: {value**0.5:.3g}" for index, value in enumerate(found.sh_energies))
+        root = ", ".join(
+            f"degree {index + 1}: {value**0.5:.3g}" for index, value in enumerate(found.sh_energies)
+        )
         print(f"what SH add to colours, root mean square: {root}")
     for name, corners in (("all", found.bounds), ("middle 96 %", found.content)):
         if corners:
@@ -110,7 +131,10 @@ def _print(found: SceneInfo) -> None:
     step = 1 / max(len(found.opacities), 1)
     _bars("opacity", {f"{index * step:.1f}": count for index, count in enumerate(found.opacities)})
     _bars("largest standard deviation, scene units, from", found.sizes)
-    print("suspicious: " + (", ".join(f"{what} {n:,}" for what, n in found.suspicious.items()) or "nothing"))
+    print(
+        "suspicious: "
+        + (", ".join(f"{what} {n:,}" for what, n in found.suspicious.items()) or "nothing")
+    )
 
 
 def _bars(title: str, counts: dict[str, int]) -> None:

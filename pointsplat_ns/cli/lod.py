@@ -31,29 +31,35 @@ def lod(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
+    """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error
+    of each measured.
 
-    With --stream, the whole scene and these levels are written as a streamed SOG, of which viewers load the parts that
-    they need. With --tiles, they are written as 3D Tiles.
+    With --stream, the whole scene and these levels are written as a streamed SOG, of which viewers
+    load the parts that they need. With --tiles, they are written as 3D Tiles.
 
-    Each level is merged from the one before, so that every Gaussian has one parent in the next coarser level. Renders
-    are compared with the dense scene's, from --poses, else from the poses of the run's dataset if it is found, else
-    from sampled poses.
+    Each level is merged from the one before, so that every Gaussian has one parent in the next
+    coarser level. Renders are compared with the dense scene's, from --poses, else from the poses of
+    the run's dataset if it is found, else from sampled poses.
 
     Args:
-        levels: sizes of the levels, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
-            file (12MB).
-        output: the folder for the levels (level_0.ply is the finest) and the manifest lod.json; by default beside the
-            scene: room_lod for room.ply, lod in the folder of a run. With --stream, the folder for lod-meta.json and
-            its SOG files, by default room_stream; with --tiles, that for tileset.json and its glTF files, by default
-            room_tiles. A name that ends in .rad is a file for Spark.
-        stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
+        levels: sizes of the levels, in any order: ratios (0.3), percentages (30%), counts (50000)
+            or sizes of the file (12MB).
+        output: the folder for the levels (level_0.ply is the finest) and the manifest lod.json; by
+            default beside the scene: room_lod for room.ply, lod in the folder of a run. With
+            --stream, the folder for lod-meta.json and its SOG files, by default room_stream; with
+            --tiles, that for tileset.json and its glTF files, by default room_tiles. A name that
+            ends in .rad is a file for Spark.
+        stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its
+            finest level.
         tiles: write 3D Tiles of glTF with SPZ (CesiumJS). The scene itself is their finest level.
-        at: where tiles lie on the Earth: the UTM zone of the scene's coordinates (EPSG:32632), or the latitude,
-            longitude and height of its origin in degrees and metres (48.86,2.29,35; --at=-33.9,... in the south), with
-            up turned to the zenith. By default they have the frame of the scene's file.
-        sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
-        effort: length of the repair of each level, as for compact: none (instant), quick, or thorough.
+        at: where tiles lie on the Earth: the UTM zone of the scene's coordinates (EPSG:32632), or
+            the latitude, longitude and height of its origin in degrees and metres (48.86,2.29,35;
+            --at=-33.9,... in the south), with up turned to the zenith. By default they have the
+            frame of the scene's file.
+        sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders
+            reach 40 dB.
+        effort: length of the repair of each level, as for compact: none (instant), quick, or
+            thorough.
         json_output: print the manifest, and nothing else on standard output.
     """
     options.need_scenes(scene)
@@ -62,17 +68,32 @@ def lod(
 
     options.need_one_scene(scene)
     options.check_poses(poses)
-    folder = output or options.output_beside(scene, "stream" if stream else "tiles" if tiles else "lod", "")
+    folder = output or options.output_beside(
+        scene, "stream" if stream else "tiles" if tiles else "lod", ""
+    )
     for_viewers = stream or tiles or folder.suffix.lower() == ".rad"
     made = ps.lod(
-        scene, ("100%", *levels) if for_viewers else levels, sh=sh, effort=effort, views=poses,
-        resolution=resolution, up=up, data=data, folder=folder, stream=stream, tiles=tiles, at=at, force=force,
+        scene,
+        ("100%", *levels) if for_viewers else levels,
+        sh=sh,
+        effort=effort,
+        views=poses,
+        resolution=resolution,
+        up=up,
+        data=data,
+        folder=folder,
+        stream=stream,
+        tiles=tiles,
+        at=at,
+        force=force,
         progress=True,
-    )  # fmt: skip
+    )
     if json_output and for_viewers:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
     elif json_output:
-        print_json({"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))})
+        print_json(
+            {"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))}
+        )
     else:
         _print_table(made, folder)
     if made.interrupted:
@@ -94,7 +115,9 @@ def _print_table(made: Levels, folder: Path) -> None:
                 f"level_{index}",
                 f"{len(level.scene):,}",
                 f"{100 * len(level.scene) / len(made.dense):.3g} %",
-                three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6) if apart else "-",
+                three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6)
+                if apart
+                else "-",
                 f"{level.seconds:.1f}",
                 psnr_text(near.psnr if near else None),
                 f"{near.ssim:.2f}" if near and near.ssim is not None else "-",
@@ -103,6 +126,8 @@ def _print_table(made: Levels, folder: Path) -> None:
         )
     files = [path for path in (folder, *folder.rglob("*")) if path.is_file()]
     size = bytes_text(sum(path.stat().st_size for path in files))
-    print(f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all")
+    print(
+        f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all"
+    )
     header = ("", "Gaussians", "share", "MB", "seconds", "dB", "SSIM", "")
     print_table(header, rows, "dB: PSNR against the dense scene", left=(0, 7))

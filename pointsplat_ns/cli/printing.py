@@ -22,8 +22,8 @@ _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
 @contextmanager
 def only_json(args: list[str]) -> Iterator[None]:
-    """With ``--json`` in the arguments, only :func:`print_json` writes to standard output in this context. All other
-    output, also of libraries, goes to standard error."""
+    """With ``--json`` in the arguments, only :func:`print_json` writes to standard output in this
+    context. All other output, also of libraries, goes to standard error."""
     if "--json" not in args:
         yield
         return
@@ -42,8 +42,11 @@ def print_json(content: Any) -> None:
     print(json_text(content), file=_OUTPUT.get(), flush=True)
 
 
-def scene_result(before: int | None, scene: Gaussians | PlyRows, seconds: float, where: Path) -> dict[str, Any]:
-    """The JSON values of a result, from ``before`` Gaussians in the dense scene, if there is one."""
+def scene_result(
+    before: int | None, scene: Gaussians | PlyRows, seconds: float, where: Path
+) -> dict[str, Any]:
+    """The JSON values of a result, from ``before`` Gaussians in the dense scene, if there is
+    one."""
     return {
         "output": where,
         **({} if before is None else {"gaussians_before": before}),
@@ -63,27 +66,38 @@ def print_result(
     where: Path,
     quality: Quality | str | None,
 ) -> None:
-    """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of the file and time, and
-    how close the file is to the dense scene, or why that is not known."""
+    """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of
+    the file and time, and how close the file is to the dense scene, or why that is not known."""
     *first, last = [{"merge": "merged", "clean": "cleaned"}.get(by, f"pruned by {by}"), *also]
     done = f"{', '.join(first)} and {last}" if first else last
     what = f"{done} to {len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
     if len(scene) == before and not also:
-        nothing = {"merge": "nothing is merged", "clean": "nothing is removed"}.get(by, "nothing is pruned")
+        nothing = {"merge": "nothing is merged", "clean": "nothing is removed"}.get(
+            by, "nothing is pruned"
+        )
         what = f"{nothing}, all {before:,} Gaussians fit as they are"
     print(f"{where}: {what}, {written_size(where)}, in {seconds_text(seconds)}")
     print(quality or "not compared with the dense scene: nothing of it is visible")
 
 
 def print_if_larger(scene: Path, where: Path) -> None:
-    """Print a note if a result takes more bytes than the scene's file, whose format has fewer for each Gaussian."""
+    """Print a note if a result takes more bytes than the scene's file, whose format has fewer for
+    each Gaussian."""
     if scene.is_file() and scene.suffix != ".yml" and scene.stat().st_size < where.stat().st_size:
-        remedy = "" if scene.suffix == where.suffix else f"; a name that ends in {scene.suffix} makes it smaller"
-        print(f"note: {where} is larger than {scene}: {written_size(where)}, not {written_size(scene)}{remedy}")
+        remedy = (
+            ""
+            if scene.suffix == where.suffix
+            else f"; a name that ends in {scene.suffix} makes it smaller"
+        )
+        print(
+            f"note: {where} is larger than {scene}: {written_size(where)}, not "
+            f"{written_size(scene)}{remedy}"
+        )
 
 
 def psnr_text(psnr: float | None) -> str:
-    """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was compared."""
+    """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was
+    compared."""
     from pointsplat_ns.compression.quality import MOST_SAID
 
     return "-" if psnr is None else "same" if psnr == math.inf else f"{min(psnr, MOST_SAID):.1f}"

@@ -29,13 +29,15 @@ def render(
 ) -> None:
     """Film a scene, or two scenes side by side from the same cameras, on any machine.
 
-    The film goes exactly through the poses; without poses around an object, or past what shows most of a room.
+    The film goes exactly through the poses; without poses around an object, or past what shows most
+    of a room.
 
     Args:
         other: a second scene in the same frame, to compare with.
-        output: .mp4 for a video; a folder for PNG frames, one for each pose of --poses unless --seconds is given; or
-            .png for the first frame alone. By default a video beside the scene: room.mp4 for room.ply, render.mp4 in
-            the folder of a run. It appears when it is complete.
+        output: .mp4 for a video; a folder for PNG frames, one for each pose of --poses unless
+            --seconds is given; or .png for the first frame alone. By default a video beside the
+            scene: room.mp4 for room.ply, render.mp4 in the folder of a run. It appears when it is
+            complete.
         width: width of one scene's picture, pixels; by default that of the photos, at most 960.
         height: its height, pixels; by default in the proportion of the photos.
         fps: frames a second.
@@ -48,13 +50,26 @@ def render(
     start = time.perf_counter()
     options.check_poses(poses)
     beside = options.output_beside(scene, "render", ".mp4")
-    output = output or (beside if beside.name == "render.mp4" else beside.with_name(f"{scene.stem}.mp4"))
+    output = output or (
+        beside if beside.name == "render.mp4" else beside.with_name(f"{scene.stem}.mp4")
+    )
     count = ps.render_path(
-        scene, output, other, views=poses, up=up, data=data, width=width, height=height,
-        fps=fps, seconds=seconds, force=force, progress=True,
-    )  # fmt: skip
+        scene,
+        output,
+        other,
+        views=poses,
+        up=up,
+        data=data,
+        width=width,
+        height=height,
+        fps=fps,
+        seconds=seconds,
+        force=force,
+        progress=True,
+    )
     files = output.iterdir() if output.is_dir() else [output]
-    size, seconds_taken = sum(file.stat().st_size for file in files), time.perf_counter() - start
+    size = sum(file.stat().st_size for file in files)
+    seconds_taken = time.perf_counter() - start
     if json_output:
         print_json({"output": output, "frames": count, "bytes": size, "seconds": seconds_taken})
         return

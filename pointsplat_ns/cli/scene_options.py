@@ -1,4 +1,5 @@
-"""Arguments and output paths that several commands share, and how counts and sizes are read as people write them."""
+"""Arguments and output paths that several commands share, and how counts and sizes are read as
+people write them."""
 
 from __future__ import annotations
 
@@ -14,21 +15,24 @@ from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_
 ONE_SCENE = "a file of any format, a checkpoint, or a run (its folder or config.yml)"
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=ONE_SCENE)]
-Scenes = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=f"{ONE_SCENE}, or a folder of scenes")]
+Scenes = Annotated[
+    Path, tyro.conf.Positional, tyro.conf.arg(help=f"{ONE_SCENE}, or a folder of scenes")
+]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 Poses = Annotated[
     Path | None,
     tyro.conf.arg(
-        help="a file of cameras of the scene: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a "
-        "COLMAP project. By default the views of its dataset, or of such a file beside the scene or above it, or "
-        "sampled ones; none always samples them."
+        help="a file of cameras of the scene: cameras.json of 3DGS, transforms.json of "
+        "nerfstudio, or the folder of a COLMAP project. By default the views of its dataset, or of "
+        "such a file beside the scene or above it, or sampled ones; none always samples them."
     ),
 ]
 Resolution = Annotated[
     str | None,
     tyro.conf.arg(
         metavar="WxH",
-        help="size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By "
+        help="size of the pictures that people look at, pixels. Decisions by rendering are made "
+        "at this size. By "
         "default the size of the photos, if there are any, else 1920x1080.",
     ),
 ]
@@ -36,14 +40,16 @@ Up = Annotated[
     str | None,
     tyro.conf.arg(
         metavar="AXIS",
-        help="the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the "
+        help="the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are "
+        "sampled; by default the "
         "file's own, or an estimate. Write --up=-y for a negative axis.",
     ),
 ]
 Data = Annotated[
     Path | None,
     tyro.conf.arg(
-        help="folder of the run's photos and poses, or one above it, if it is no longer where the run says. In a "
+        help="folder of the run's photos and poses, or one above it, if it is no longer where the "
+        "run says. In a "
         "folder of scenes, a run whose data is not found gets sampled views, which its note says."
     ),
 ]
@@ -51,18 +57,23 @@ Bands = Literal["all", "auto", "0", "1", "2", "3"]
 Force = Annotated[bool, tyro.conf.arg(help="overwrite existing files.")]
 Jobs = Annotated[
     int | None,
-    tyro.conf.arg(help="for a folder: number of processes that share the work and the cores; by default 1."),
+    tyro.conf.arg(
+        help="for a folder: number of processes that share the work and the cores; by default 1."
+    ),
 ]
 Verbose = Annotated[bool, tyro.conf.arg(help="print more: what was chosen for the scene.")]
 Json = Annotated[
-    bool, tyro.conf.arg(name="json", help="print the result as JSON, and nothing else on standard output.")
+    bool,
+    tyro.conf.arg(
+        name="json", help="print the result as JSON, and nothing else on standard output."
+    ),
 ]
 
 
 def output_beside(scene: Path, what: str, suffix: str | None = None) -> Path:
-    """The default path of a result, by default in the format of the scene's file. For a file, it is beside it:
-    ``room_pruned.ply`` for ``room.ply``. For a run, it is in its folder: ``pruned.ply``; never in its checkpoint
-    folder, because nerfstudio takes every file there for a checkpoint."""
+    """The default path of a result, by default in the format of the scene's file. For a file, it is
+    beside it: ``room_pruned.ply`` for ``room.ply``. For a run, it is in its folder: ``pruned.ply``;
+    never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint."""
     from pointsplat_ns.io.formats import format_like
 
     name = f"{what}{format_like(scene).suffix if suffix is None else suffix}"
@@ -76,7 +87,8 @@ def output_beside(scene: Path, what: str, suffix: str | None = None) -> Path:
 
 
 def need_scenes(*paths: Path | None) -> None:
-    """Raise a SceneError, before torch is imported, that names all paths at which there is nothing."""
+    """Raise a SceneError, before torch is imported, that names all paths at which there is
+    nothing."""
     from pointsplat_ns.errors import SceneError
 
     gone = []
@@ -104,9 +116,11 @@ def need_one_scene(path: Path) -> None:
         )
 
 
-def check_outputs(scene: Path | None, force: bool, png: Path | None = None, html: Path | None = None) -> None:
-    """Check the files that a command is going to write (a scene of any writable format, a picture, a page) before its
-    long computations. Raises SceneError if a path has another suffix, or as
+def check_outputs(
+    scene: Path | None, force: bool, png: Path | None = None, html: Path | None = None
+) -> None:
+    """Check the files that a command is going to write (a scene of any writable format, a picture,
+    a page) before its long computations. Raises SceneError if a path has another suffix, or as
     :func:`~pointsplat_ns.io.files.need_writable`."""
     from pointsplat_ns.io.files import need_suffix, need_writable
     from pointsplat_ns.io.formats import format_to_write
@@ -130,7 +144,8 @@ def check_poses(poses: Path | None) -> None:
 
     if not (without_poses(poses) or is_camera_file(poses)):
         raise SceneError(
-            f"{poses}: a run or a scene; expected {CAMERA_KINDS}; the poses of a run's own dataset need no --poses"
+            f"{poses}: a run or a scene; expected {CAMERA_KINDS}; the poses of a run's own "
+            "dataset need no --poses"
         )
 
 
@@ -139,7 +154,9 @@ def _spec(metavar: str, parse: Callable[[str], Any]) -> PrimitiveConstructorSpec
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: parse(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, (int, float)) and not isinstance(value, bool),
+        is_instance=lambda value: (
+            value is None or isinstance(value, (int, float)) and not isinstance(value, bool)
+        ),
         str_from_instance=lambda value: [f"{value:g}" if isinstance(value, float) else str(value)],
     )
 
@@ -157,7 +174,9 @@ Photos = Annotated[
         metavar="[FOLDER]",
         instance_from_str=_photos,
         is_instance=lambda value: isinstance(value, (bool, Path)),
-        str_from_instance=lambda value: [str(value)] if isinstance(value, Path) else [] if value else ["none"],
+        str_from_instance=lambda value: (
+            [str(value)] if isinstance(value, Path) else [] if value else ["none"]
+        ),
     ),
 ]
 """Whether to use the photos of a run, or the folder of other photos."""
@@ -167,9 +186,11 @@ Megabytes = Annotated[float, _spec("MB", parse_megabytes)]
 
 
 def quantities() -> ConstructorRegistry:
-    """A context in which tyro reads numbers as :func:`~pointsplat_ns.system.quantities.parse_number` does, and refuses
-    empty paths, which would be the current folder: those of a script whose variable is not set."""
-    registry, rules = ConstructorRegistry(), {int: _spec("INT", parse_count), float: _spec("FLOAT", _float)}
+    """A context in which tyro reads numbers as
+    :func:`~pointsplat_ns.system.quantities.parse_number` does, and refuses empty paths, which would
+    be the current folder: those of a script whose variable is not set."""
+    registry = ConstructorRegistry()
+    rules = {int: _spec("INT", parse_count), float: _spec("FLOAT", _float)}
 
     path = PrimitiveConstructorSpec(
         nargs=1,
@@ -186,7 +207,11 @@ def quantities() -> ConstructorRegistry:
         kinds = [kind for kind in get_args(info.type) or (info.type,) if kind is not type(None)]
         if len(kinds) != 1:
             return None
-        own = [item for item in getattr(kinds[0], "__metadata__", ()) if isinstance(item, PrimitiveConstructorSpec)]
+        own = [
+            item
+            for item in getattr(kinds[0], "__metadata__", ())
+            if isinstance(item, PrimitiveConstructorSpec)
+        ]
         return own[0] if own else rules.get(kinds[0])  # of an optional number as of the number
 
     return registry
@@ -199,4 +224,6 @@ def _path(text: str) -> Path:
 
 
 def _float(text: str) -> float:
-    return float(text) if text.lower().lstrip("+-") in ("nan", "inf") else parse_number(text)  # commands refuse them
+    return (
+        float(text) if text.lower().lstrip("+-") in ("nan", "inf") else parse_number(text)
+    )  # commands refuse them

@@ -31,20 +31,20 @@ def tradeoff(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Measure how a scene trades quality for frame time, size and count, on this machine: each method and repair at
-    each budget. The figures are written as JSON, and as a page with pictures.
+    """Measure how a scene trades quality for frame time, size and count, on this machine: each
+    method and repair at each budget. The figures are written as JSON, and as a page with pictures.
 
     Args:
-        output: the folder for the results; by default beside the scene: room_tradeoff for room.ply, tradeoff in the
-            folder of a run.
+        output: the folder for the results; by default beside the scene: room_tradeoff for room.ply,
+            tradeoff in the folder of a run.
         keep: budgets: ratios (30%), counts (50000) or sizes (12MB).
-        within: largest loss of the recommended point against photos, dB. Without photos the loss is estimated from
-            renders.
+        within: largest loss of the recommended point against photos, dB. Without photos the loss is
+            estimated from renders.
         by: methods of prune.
         repairs: repairs to try: none, compact's efforts quick and thorough, or its --photos.
         views: largest number of views; without photos at most 12.
-        photos: folder of photos to judge by, where the scene is no run: every eighth, by name. --poses names the file
-            with their poses, or one is looked for.
+        photos: folder of photos to judge by, where the scene is no run: every eighth, by name.
+            --poses names the file with their poses, or one is looked for.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -55,9 +55,21 @@ def tradeoff(
     options.check_poses(poses)
     folder = output or options.output_beside(scene, "tradeoff", "")
     found = ps.measure_tradeoff(
-        scene, folder, keep=keep, within=within, by=by, repairs=repairs, views=views, poses=poses,
-        resolution=resolution, up=up, data=data, photos=photos, force=force, progress=True,
-    )  # fmt: skip
+        scene,
+        folder,
+        keep=keep,
+        within=within,
+        by=by,
+        repairs=repairs,
+        views=views,
+        poses=poses,
+        resolution=resolution,
+        up=up,
+        data=data,
+        photos=photos,
+        force=force,
+        progress=True,
+    )
     if json_output:
         print_json({"output": folder, **json.loads((folder / RESULTS["json"]).read_text("utf-8"))})
         return
@@ -66,7 +78,9 @@ def tradeoff(
         print(f"note: {note}")
     print(found.why)
     best = found.point(found.recommended)
-    best = next_best(found.points) or best if best is found.points[0] else best  # the dense scene needs no command
+    best = (
+        next_best(found.points) or best if best is found.points[0] else best
+    )  # the dense scene needs no command
     if best is not found.points[0]:
         print(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
     if best.command:
@@ -92,7 +106,11 @@ def _print_table(found: Tradeoff) -> None:
                 "{:.1f} ({:.1f}-{:.1f})".format(*point.speed),
                 three_digits(point.frame_ms),
                 f"{point.fill:.1f}",
-                *([psnr_text(point.against_photos.psnr if point.against_photos else None)] if photos else []),
+                *(
+                    [psnr_text(point.against_photos.psnr if point.against_photos else None)]
+                    if photos
+                    else []
+                ),
                 psnr_text(point.against_dense.psnr),
                 f"{point.against_dense.ssim:.2f}",
             )
@@ -101,6 +119,6 @@ def _print_table(found: Tradeoff) -> None:
     print_table(
         (*columns, *(["dB,\nphotos"] if photos else []), "dB,\ndense", "SSIM"),
         rows,
-        "*: recommended; times as fast as the dense scene: median and quartiles over views; fill: Gaussians "
-        "drawn per pixel; dB of PSNR, and SSIM, against the dense scene",
+        "*: recommended; times as fast as the dense scene: median and quartiles over views; fill: "
+        "Gaussians drawn per pixel; dB of PSNR, and SSIM, against the dense scene",
     )

@@ -18,22 +18,28 @@ def view(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> None:
-    """Look at a scene in the browser, or at two from the same camera. A slider keeps less of the Gaussians, merged as
-    `prune` does. The browser draws; it needs WebGL 2. Ctrl-C ends it.
+    """Look at a scene in the browser, or at two from the same camera. A slider keeps less of the
+    Gaussians, merged as `prune` does. The browser draws; it needs WebGL 2. Ctrl-C ends it.
 
     Args:
-        scene: a file of any format, a checkpoint, or a run (its folder or config.yml); by default the page
-            takes a file that is dropped on it.
-        other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
-        host: the address to listen on; by default only this machine has access. With another address, every machine
-            that reaches it has access.
+        scene: a file of any format, a checkpoint, or a run (its folder or config.yml); by default
+            the page takes a file that is dropped on it.
+        other: a second scene in the same frame, to compare with; by default the first is compared
+            with all of itself.
+        host: the address to listen on; by default only this machine has access. With another
+            address, every machine that reaches it has access.
         port: the first port to try; 0 takes any free port.
     """
     options.need_scenes(scene, other)
     import pointsplat_ns as ps
 
     options.check_poses(poses)
-    with ps.open_viewer(scene, other, views=poses, up=up, data=data, host=host, port=port) as viewer:
+    with ps.open_viewer(
+        scene, other, views=poses, up=up, data=data, host=host, port=port
+    ) as viewer:
         print(f"{viewer.url}: open it in a browser; Ctrl-C ends it")
-        print(f"it begins at {viewer.origin}" if viewer.origin else "drop a scene on the page", flush=True)
+        print(
+            f"it begins at {viewer.origin}" if viewer.origin else "drop a scene on the page",
+            flush=True,
+        )
         viewer.wait()

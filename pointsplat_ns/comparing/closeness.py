@@ -1,7 +1,8 @@
 """Compares renders of a smaller scene with renders of the dense scene. No photos are needed.
 
-Every PSNR against the dense scene counts all squared error, halos included, over the pixels that the dense scene covers
-(:func:`~pointsplat_ns.metrics.psnr_of`), so that empty background does not make it better.
+Every PSNR against the dense scene counts all squared error, halos included, over the pixels that
+the dense scene covers (:func:`~pointsplat_ns.metrics.psnr_of`), so that empty background does not
+make it better.
 """
 
 from __future__ import annotations
@@ -34,11 +35,14 @@ class Closeness:
     @property
     def where(self) -> str:
         """Text: the number of views, and their width."""
-        return views_text(len(self.errors)) + ("" if self.width is None else f" of {self.width} pixels")
+        return views_text(len(self.errors)) + (
+            "" if self.width is None else f" of {self.width} pixels"
+        )
 
     @property
     def psnr(self) -> float:
-        """PSNR over the pixels that the dense scene covers in all views, dB; inf if nothing differs."""
+        """PSNR over the pixels that the dense scene covers in all views, dB; inf if nothing
+        differs."""
         return psnr_of(sum(self.errors) / len(self.errors), sum(self.covered) / len(self.covered))
 
     @property
@@ -58,14 +62,19 @@ class Reference:
     covered: tuple[float, ...]
     """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
     alphas: list[Tensor] | None = None
-    """C alpha pictures (H, W, 1), for errors over two backgrounds; None for errors over the views' own."""
+    """C alpha pictures (H, W, 1), for errors over two backgrounds; None for errors over the views'
+    own."""
 
-    def psnr(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> tuple[float, float]:
+    def psnr(
+        self, scene: Gaussians, progress: Callable[[float], None] | None = None
+    ) -> tuple[float, float]:
         """PSNR over all views, and of the worst view, dB; see :class:`Closeness`."""
         close = self.closeness(scene, progress)
         return close.psnr, close.worst
 
-    def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:
+    def closeness(
+        self, scene: Gaussians, progress: Callable[[float], None] | None = None
+    ) -> Closeness:
         """Errors of a scene; ``progress`` is called with the share of the views done."""
         return self._closeness(_drawn(scene, self.views), progress)
 
@@ -78,12 +87,16 @@ class Reference:
         """SSIM of a scene, mean over the views. Views must not be smaller than its window."""
         total = 0.0
         for (image, _), target in zip(_drawn(scene, self.views), self.renders, strict=True):
-            total += float(mean_ssim(image.permute(2, 0, 1)[None], target.to(image).permute(2, 0, 1)[None]))
+            total += float(
+                mean_ssim(image.permute(2, 0, 1)[None], target.to(image).permute(2, 0, 1)[None])
+            )
         return total / len(self.renders)
 
     @torch.no_grad()
     def _closeness(
-        self, pictures: Iterable[tuple[Tensor, Tensor | None]], progress: Callable[[float], None] | None
+        self,
+        pictures: Iterable[tuple[Tensor, Tensor | None]],
+        progress: Callable[[float], None] | None,
     ) -> Closeness:
         """Errors of images, with their alpha where :attr:`alphas` are compared, too."""
         errors: list[float] = []
@@ -91,7 +104,9 @@ class Reference:
             apart = image.double() - target.double()
             error = float(apart.square().mean())
             if self.alphas is not None and alpha is not None:
-                other = (1 - 2 * self.views.background).to(apart)  # from a background to its opposite
+                other = (1 - 2 * self.views.background).to(
+                    apart
+                )  # from a background to its opposite
                 over_other = apart - (alpha - self.alphas[index]).double() * other
                 error = 0.5 * (error + float(over_other.square().mean()))
             errors.append(error)
@@ -106,9 +121,9 @@ class DenseReference(Reference):
     Args:
         dense: N Gaussians.
         views: C views.
-        both_backgrounds: errors are means over two backgrounds, the views' own and its opposite (white for black):
-            the viewer's background is unknown, and a scene that fits one may be too transparent or too opaque for the
-            other.
+        both_backgrounds: errors are means over two backgrounds, the views' own and its opposite
+            (white for black): the viewer's background is unknown, and a scene that fits one may be
+            too transparent or too opaque for the other.
     """
 
     @torch.no_grad()

@@ -1,9 +1,10 @@
 """Pictures of several sizes, drawn in few pixels.
 
-3DGS adds 0.3 pixels^2 to the covariance of every projected Gaussian. So a scene that is right in small pictures may be
-wrong in large ones, and the other way around. Nothing else in a pixel depends on the size of the picture: every k-th
-pixel of a large picture is the picture of k times fewer pixels a side, with 0.3 / k^2 in place of 0.3. Such a
-subsampled picture covers all that the large one shows, at the cost of the small one.
+3DGS adds 0.3 pixels^2 to the covariance of every projected Gaussian. So a scene that is right in
+small pictures may be wrong in large ones, and the other way around. Nothing else in a pixel depends
+on the size of the picture: every k-th pixel of a large picture is the picture of k times fewer
+pixels a side, with 0.3 / k^2 in place of 0.3. Such a subsampled picture covers all that the large
+one shows, at the cost of the small one.
 """
 
 from __future__ import annotations
@@ -43,8 +44,12 @@ def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | No
     if text is None:
         return None
     parts = text.lower().split("x") if isinstance(text, str) else [str(part) for part in text]
-    if len(parts) != 2 or not all(part.strip().isdecimal() and 1 <= int(part) <= 16384 for part in parts):
-        raise PointSplatError(f"resolution is {text!r}; expected width and height in pixels, such as 1920x1080")
+    if len(parts) != 2 or not all(
+        part.strip().isdecimal() and 1 <= int(part) <= 16384 for part in parts
+    ):
+        raise PointSplatError(
+            f"resolution is {text!r}; expected width and height in pixels, such as 1920x1080"
+        )
     return int(parts[0]), int(parts[1])
 
 
@@ -54,15 +59,20 @@ def size_text(resolution: tuple[int, int]) -> str:
 
 
 def sides_of(width: int, height: int) -> tuple[int, ...]:
-    """Longer sides of the pictures that renders are compared in, pixels: :data:`SMALLEST_SIDE`, the whole
-    size, and their geometric mean. The whole size alone if it is no larger than the smallest.
+    """Longer sides of the pictures that renders are compared in, pixels: :data:`SMALLEST_SIDE`, the
+    whole size, and their geometric mean. The whole size alone if it is no larger than the smallest.
 
     Example:
         >>> sides_of(1920, 1080), sides_of(540, 360), sides_of(64, 48)
         ((320, 784, 1920), (320, 416, 540), (64,))
     """
-    longest, smallest = max(width, height), SMALLEST_SIDE
-    return (longest,) if longest <= smallest else (smallest, round(math.sqrt(smallest * longest)), longest)
+    longest = max(width, height)
+    smallest = SMALLEST_SIDE
+    return (
+        (longest,)
+        if longest <= smallest
+        else (smallest, round(math.sqrt(smallest * longest)), longest)
+    )
 
 
 def middle_side(views: Views) -> int:
@@ -81,19 +91,20 @@ def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
 
     Args:
         views: C views of any size.
-        side: longer side of the whole pictures, pixels. If it is larger than the views' own, the pictures are as large
-            as those of a camera that is nearer.
-        drawn_side: longer side of what is drawn, pixels; at most that of ``views``. By default ``side``, and at most
-            :data:`SMALLEST_SIDE`.
+        side: longer side of the whole pictures, pixels. If it is larger than the views' own, the
+            pictures are as large as those of a camera that is nearer.
+        drawn_side: longer side of what is drawn, pixels; at most that of ``views``. By default
+            ``side``, and at most :data:`SMALLEST_SIDE`.
     """
     drawn = views.resized(min(side, SMALLEST_SIDE) if drawn_side is None else drawn_side)
     return replace(drawn, eps2d=views.eps2d * (max(drawn.width, drawn.height) / side) ** 2)
 
 
 def several_sizes(views: Views, drawn_side: int = SMALLEST_SIDE) -> tuple[Views, Views, Views]:
-    """Views to optimise on, subsampled from pictures of three sizes: their :func:`middle_side`, their whole size, and
-    :data:`NEARER` times that. By default, drawn pictures are no larger than the smallest: many views teach more than
-    many pixels of few. Without the third, a garden gains 0.2 dB less at 1920 pixels, and as much at 960."""
+    """Views to optimise on, subsampled from pictures of three sizes: their :func:`middle_side`,
+    their whole size, and :data:`NEARER` times that. By default, drawn pictures are no larger than
+    the smallest: many views teach more than many pixels of few. Without the third, a garden gains
+    0.2 dB less at 1920 pixels, and as much at 960."""
     whole = max(views.width, views.height)
     sides = middle_side(views), whole, NEARER * whole
     middle, full, nearer = (subsampled(views, side, min(side, whole, drawn_side)) for side in sides)
@@ -101,8 +112,8 @@ def several_sizes(views: Views, drawn_side: int = SMALLEST_SIDE) -> tuple[Views,
 
 
 class RendersOfSizes:
-    """Renders of a dense scene, subsampled from pictures of several sizes, with which renders of other scenes are
-    compared over two backgrounds.
+    """Renders of a dense scene, subsampled from pictures of several sizes, with which renders of
+    other scenes are compared over two backgrounds.
 
     Args:
         dense: N Gaussians.
@@ -113,7 +124,9 @@ class RendersOfSizes:
     @torch.no_grad()
     def __init__(self, dense: Gaussians, views: Views, sides: Sequence[int]):
         drawn = [subsampled(views, side) for side in sides]
-        self.references = [DenseReference(dense, of_side, both_backgrounds=True) for of_side in drawn]
+        self.references = [
+            DenseReference(dense, of_side, both_backgrounds=True) for of_side in drawn
+        ]
         """Renders of the dense scene, for each side."""
 
     def psnrs(self, scene: Gaussians) -> list[float]:

@@ -1,7 +1,8 @@
 """Accepts a change to a smaller scene, a refinement or a repair, or leaves it out.
 
-The scene after it is compared with the scene before it. It is kept if it gains in whole pictures of a middle size,
-lowers the error in at least half of the views, and harms no picture of another size, or by little of what it gains.
+The scene after it is compared with the scene before it. It is kept if it gains in whole pictures of
+a middle size, lowers the error in at least half of the views, and harms no picture of another size,
+or by little of what it gains.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ class AcceptanceSettings:
     most_loss: float = 0.05
     """Largest loss of PSNR, in dB, in pictures of another size."""
     lost_share: float = 0.25
-    """The same as a share of the gain, if that is more: details smaller than a pixel look larger in small pictures, so
-    that no few Gaussians are right in all sizes."""
+    """The same as a share of the gain, if that is more: details smaller than a pixel look larger in
+    small pictures, so that no few Gaussians are right in all sizes."""
 
 
 ACCEPTANCE = AcceptanceSettings()
@@ -35,8 +36,9 @@ SMALL_GAIN = f"it brings less than {ACCEPTANCE.min_gain:g} dB"
 
 
 class Comparison:
-    """Compares scenes with the dense scene: in whole pictures of a middle size, and in subsampled pictures of the
-    smallest size, of the full size, and of a larger size that stands for nearer cameras.
+    """Compares scenes with the dense scene: in whole pictures of a middle size, and in subsampled
+    pictures of the smallest size, of the full size, and of a larger size that stands for nearer
+    cameras.
 
     Args:
         dense: N Gaussians, on the device that renders.
@@ -62,7 +64,8 @@ class Comparison:
         Args:
             before: errors of ``old``.
             old, new: the scenes before and after.
-            progress: called with the name of the current task and the share of it that is done, in [0, 1].
+            progress: called with the name of the current task and the share of it that is done, in
+                [0, 1].
         """
         end = new.to(self.device)
         after = self.reference.closeness(end, lambda share: progress("comparing renders", share))
@@ -70,21 +73,26 @@ class Comparison:
         if not reason and self._others is not None:
             lost = max(ACCEPTANCE.most_loss, ACCEPTANCE.lost_share * (after.psnr - before.psnr))
             least = (psnr - lost for psnr in self._others.psnrs(old.to(self.device)))
-            if not all(psnr >= bound for bound, psnr in zip(least, self._others.psnrs(end), strict=True)):  # NaN too
+            if not all(
+                psnr >= bound for bound, psnr in zip(least, self._others.psnrs(end), strict=True)
+            ):  # NaN too
                 reason = "it harms pictures of another size"
         return after, reason
 
 
 def _why_no_gain(before: Closeness, after: Closeness) -> str:
-    """Why errors are no improvement; empty if PSNR rises by :attr:`AcceptanceSettings.min_gain` or more, and the error
-    falls in at least half of the views. The second condition refuses a gain of few views at the cost of the others."""
+    """Why errors are no improvement; empty if PSNR rises by :attr:`AcceptanceSettings.min_gain` or
+    more, and the error falls in at least half of the views. The second condition refuses a gain of
+    few views at the cost of the others."""
     if after.errors == before.errors:
         return "it changes nothing"
     if after.psnr <= before.psnr:
         return "it does not help"
     if not after.psnr >= before.psnr + ACCEPTANCE.min_gain:  # NaN too
         return SMALL_GAIN
-    return "it is farther in most views" if 2 * closer_in(before, after) < len(before.errors) else ""
+    return (
+        "it is farther in most views" if 2 * closer_in(before, after) < len(before.errors) else ""
+    )
 
 
 def closer_in(before: Closeness, after: Closeness) -> int:

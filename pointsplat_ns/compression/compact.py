@@ -1,5 +1,6 @@
-"""Compacts a scene in stages: prune, refine, repair, and round for a file of limited size. Refinement and repair are
-accepted by comparing renders with those of the dense scene. For a quality after all stages, counts are searched."""
+"""Compacts a scene in stages: prune, refine, repair, and round for a file of limited size.
+Refinement and repair are accepted by comparing renders with those of the dense scene. For a quality
+after all stages, counts are searched."""
 
 from __future__ import annotations
 
@@ -38,18 +39,19 @@ def compact_scene(
     progress: Progress = silent,
     photos: Photos | None = None,
 ) -> Compacted:
-    """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the request. Scenes of the
-    result are on the device of ``dense``. By default views are sampled. With ``photos``, and a budget for
-    it, the scene is trained on them, and repaired only where that harms: a repair before brings nothing (a tenth of
-    fox, figure, ray and vr_project: within 0.1 dB in held-out photos, and within 0.2 dB in sampled views), unless the
-    scene is large.
+    """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the
+    request. Scenes of the result are on the device of ``dense``. By default views are sampled. With
+    ``photos``, and a budget for it, the scene is trained on them, and repaired only where that
+    harms: a repair before brings nothing (a tenth of fox, figure, ray and vr_project: within 0.1 dB
+    in held-out photos, and within 0.2 dB in sampled views), unless the scene is large.
 
     Refinement and repair are accepted by comparing renders with those of the dense scene
-    (:mod:`~pointsplat_ns.compression.acceptance`). A requested PSNR (``auto``) is reached before refinement, so that it
-    holds in any case. The repair uses other views than the comparison.
+    (:mod:`~pointsplat_ns.compression.acceptance`). A requested PSNR (``auto``) is reached before
+    refinement, so that it holds in any case. The repair uses other views than the comparison.
 
     Raises:
-        BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.compression.prune.prune_scene`.
+        BudgetError, SceneError, PointSplatError: as
+            :func:`~pointsplat_ns.compression.prune.prune_scene`.
         SceneError: if the SH degree exceeds the refiner's.
         DataError: if the budget or ``sh`` needs views and there are none.
     """
@@ -59,7 +61,9 @@ def compact_scene(
     at_work = dense.to(request.device)
     pruned = prune_scene(at_work, request.prune, views, progress, rounding=False)
     pruned = replace(pruned, scene=pruned.scene.to(dense.device))
-    judge, reference, uncompared = None, None, ""
+    judge = None
+    reference = None
+    uncompared = ""
     try:
         progress("comparing renders", 0.0)
         judge = Comparison(at_work, views)
@@ -67,22 +71,34 @@ def compact_scene(
     except DataError as error:
         uncompared = f"it cannot be compared with the dense scene ({error})"
     before = None if reference is None else reference.closeness(pruned.scene.to(at_work.device))
-    stages = [Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)]
+    stages = [
+        Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)
+    ]
     if request.refiner is not None:
         stages.append(_refined(stages[0], request.refiner, judge, uncompared, progress))
     left = last_kept(stages)
     comparable = left.after is not None and left.after.psnr < math.inf and not request.repair.empty
-    repairing, budget = judge if comparable else None, request.photos
+    repairing = judge if comparable else None
+    budget = request.photos
     training = None if budget is None or budget.empty else photos
     if repairing is not None and (training is None or len(left.scene) > PHOTO_REPAIR.large):
-        stages.append(repaired_stage(left, at_work, request.repair, repairing, views, progress, request.unfinished))
+        stages.append(
+            repaired_stage(
+                left, at_work, request.repair, repairing, views, progress, request.unfinished
+            )
+        )
         repairing = None
     if training is not None and budget is not None and not stages[-1].interrupted:
         progress("training on photos", 0.0)
-        report, scene = functools.partial(progress, "training on photos"), last_kept(stages).scene.to(at_work.device)
+        report = functools.partial(progress, "training on photos")
+        scene = last_kept(stages).scene.to(at_work.device)
         trained = photo_repair(scene, at_work, training, views, budget, report)
         if repairing is not None and trained.why_not() and not trained.interrupted:
-            stages.append(repaired_stage(left, at_work, request.repair, repairing, views, progress, request.unfinished))
+            stages.append(
+                repaired_stage(
+                    left, at_work, request.repair, repairing, views, progress, request.unfinished
+                )
+            )
             if stages[-1].accepted:
                 trained = trained.beside(stages[-1].scene.to(at_work.device), training)
         stages.append(_trained(last_kept(stages), trained, reference))
@@ -91,18 +107,35 @@ def compact_scene(
         stages += rounding_stage(last_kept(stages), pruned.limit, reference)
     seen = (views.text,) if views.origin and views.text not in pruned.notes else ()
     seconds = time.perf_counter() - start
-    return Compacted(tuple(stages), (*seen, *pruned.notes), reference, seconds, uncompared, interrupted=interrupted)
+    return Compacted(
+        tuple(stages),
+        (*seen, *pruned.notes),
+        reference,
+        seconds,
+        uncompared,
+        interrupted=interrupted,
+    )
 
 
 def _refined(
-    last: Stage, refiner: TrainedRefiner, judge: Comparison | None, uncompared: str, progress: Progress
+    last: Stage,
+    refiner: TrainedRefiner,
+    judge: Comparison | None,
+    uncompared: str,
+    progress: Progress,
 ) -> Stage:
     """The refinement of the last stage by a network."""
     progress("refining", 0.0)
     refined = refiner(last.scene)
     unsound = int((last.scene.usable() & ~refined.usable()).sum())
     if unsound:
-        return Stage("refine", refined, None, last.after, f"{unsound:,} of {len(refined):,} Gaussians are not finite")
+        return Stage(
+            "refine",
+            refined,
+            None,
+            last.after,
+            f"{unsound:,} of {len(refined):,} Gaussians are not finite",
+        )
     if judge is None or last.after is None:
         return Stage("refine", refined, None, reason=uncompared)
     after, reason = judge.judged(last.after, last.scene, refined, progress)
@@ -118,23 +151,30 @@ def repaired_stage(
     progress: Progress,
     unfinished: Path | None = None,
 ) -> Stage:
-    """The repair of the last stage that was kept, which was compared; ``dense`` is on the device that renders."""
+    """The repair of the last stage that was kept, which was compared; ``dense`` is on the device
+    that renders."""
     assert last.after is not None
     progress("repairing", 0.0)
     report = functools.partial(progress, "repairing")
-    scene, psnr = last.scene.to(dense.device), last.after.psnr
+    scene = last.scene.to(dense.device)
+    psnr = last.after.psnr
     repaired = repair(scene, dense, views, budget, report, psnr=psnr, unfinished=unfinished)
     after, reason = judge.judged(last.after, last.scene, repaired.scene)
-    scene, figures = repaired.scene.to(last.scene.device), (repaired.steps, repaired.seconds, repaired.interrupted)
+    scene = repaired.scene.to(last.scene.device)
+    figures = (repaired.steps, repaired.seconds, repaired.interrupted)
     return Stage("repair", scene, after, last.after, reason, *figures)
 
 
 def _trained(last: Stage, trained: PhotoRepaired, reference: DenseReference | None) -> Stage:
-    """The scene that was trained on photos, and compared in them with the last stage that was kept."""
+    """The scene that was trained on photos, and compared in them with the last stage that was
+    kept."""
     most_lost = PHOTO_REPAIR.most_lost if last.name == "repair" else 0.0
     after = None if reference is None else reference.closeness(trained.scene)
-    scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
-    return Stage("photos", scene, after, last.after, trained.why_not(most_lost), *figures, photos=trained)
+    scene = trained.scene.to(last.scene.device)
+    figures = (trained.steps, trained.seconds, trained.interrupted)
+    return Stage(
+        "photos", scene, after, last.after, trained.why_not(most_lost), *figures, photos=trained
+    )
 
 
 def rounding_stage(last: Stage, limit: FileLimit, reference: DenseReference | None) -> list[Stage]:
@@ -142,7 +182,9 @@ def rounding_stage(last: Stage, limit: FileLimit, reference: DenseReference | No
     scene = limit.rounded(last.scene)
     if scene is last.scene:
         return []
-    after = None if reference is None else reference.closeness(scene.to(reference.renders[0].device))
+    after = (
+        None if reference is None else reference.closeness(scene.to(reference.renders[0].device))
+    )
     return [Stage("round", scene, after, last.after)]
 
 
@@ -154,24 +196,32 @@ def compact_to_psnr(
     photos: Photos | None = None,
     held_out: Photos = (),
 ) -> Compacted:
-    """:func:`compact_scene` with the fewest Gaussians that reach ``target_db`` of the request, or lose at most
-    ``most_lost`` in the held-out photos, in place of its budget.
+    """:func:`compact_scene` with the fewest Gaussians that reach ``target_db`` of the request, or
+    lose at most ``most_lost`` in the held-out photos, in place of its budget.
 
-    Each count is judged after writing and reading the scene in the format of the request: as every command judges
-    (:mod:`~pointsplat_ns.compression.quality`), or in the photos. Ctrl-C ends the search with the smallest scene found
-    so far, if any.
+    Each count is judged after writing and reading the scene in the format of the request: as every
+    command judges (:mod:`~pointsplat_ns.compression.quality`), or in the photos. Ctrl-C ends the
+    search with the smallest scene found so far, if any.
 
     Raises:
         BudgetError: if not even all Gaussians reach it.
         SceneError, PointSplatError: as :func:`compact_scene`.
         DataError: if there are no views, or no held-out photos where these judge.
     """
-    start, suffix, numbers = time.perf_counter(), request.prune.suffix, itertools.count(1)
-    judge, kind, device = Judge(dense, views), format_to_write(suffix), request.device
-    every, known = [*range(len(held_out))], 0.0
+    start = time.perf_counter()
+    suffix = request.prune.suffix
+    numbers = itertools.count(1)
+    judge = Judge(dense, views)
+    kind = format_to_write(suffix)
+    device = request.device
+    every = [*range(len(held_out))]
+    known = 0.0
     if request.most_lost is not None:
         if not every:
-            raise DataError("there are no held-out photos, in which --keep auto judges; expected a budget, such as 10%")
+            raise DataError(
+                "there are no held-out photos, in which --keep auto judges; expected a budget, "
+                "such as 10%"
+            )
         known = mean_psnr(dense.to(device), held_out, every)
 
     def measure(count: int) -> tuple[float, Compacted]:
@@ -181,21 +231,32 @@ def compact_to_psnr(
             raise KeyboardInterrupt
         if kind.rounded is not None and (psnr := judge.psnr(made.scene)[0]) <= ROUNDING.best_psnr:
             limit = FileLimit(kind, math.inf, rounding_for(psnr, made.scene.sh_degree))
-            made = replace(made, stages=(*made.stages, *rounding_stage(made.last, limit, made.reference)))
+            made = replace(
+                made, stages=(*made.stages, *rounding_stage(made.last, limit, made.reference))
+            )
         written_bytes, written = through_file(made.scene, suffix)
         if request.most_lost is None:
             psnr, _ = judge.psnr(written)
             reached = f"{decibels(psnr)} against the dense scene in {judge.where}"
         else:
             psnr = mean_psnr(written.to(device), held_out, every)
-            reached = f"{psnr:.1f} dB in {counted(len(every), 'held-out photo')}, the dense scene {known:.1f} dB"
-        return psnr, replace(made, target=f"{reached}, {bytes_text(written_bytes)}, {len(made.scene):,} Gaussians")
+            reached = (
+                f"{psnr:.1f} dB in {counted(len(every), 'held-out photo')}, the dense scene "
+                f"{known:.1f} dB"
+            )
+        return psnr, replace(
+            made, target=f"{reached}, {bytes_text(written_bytes)}, {len(made.scene):,} Gaussians"
+        )
 
     if request.target_db is not None:
         best, found = smallest_within(len(dense), measure, request.target_db, stoppable=True)
     else:  # trained on photos, a tenth loses about 0.8 dB, and 30 % no PSNR on average
         least = known - (request.most_lost or 0.0)
-        best, found = smallest_within(len(dense), measure, least, stoppable=True, first=0.15, slope=0.8)
-    target = f"{best.target}; {len(found.tried)} sizes tried" + (", interrupted" if found.interrupted else "")
+        best, found = smallest_within(
+            len(dense), measure, least, stoppable=True, first=0.15, slope=0.8
+        )
+    target = f"{best.target}; {len(found.tried)} sizes tried" + (
+        ", interrupted" if found.interrupted else ""
+    )
     seconds = time.perf_counter() - start
     return replace(best, target=target, judge=judge, interrupted=found.interrupted, seconds=seconds)

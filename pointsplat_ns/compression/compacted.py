@@ -60,7 +60,8 @@ class Compacted:
     """
 
     stages: tuple[Stage, ...]
-    """Pruning, then refinement, repair and rounding where they were tried. Scenes are on the dense scene's device."""
+    """Pruning, then refinement, repair and rounding where they were tried. Scenes are on the dense
+    scene's device."""
     notes: tuple[str, ...]
     """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
     reference: DenseReference | None
@@ -70,7 +71,8 @@ class Compacted:
     uncompared: str = ""
     """Why renders cannot be compared; empty if they are."""
     target: str = ""
-    """Text on the search for a PSNR: what was reached, and its cost; empty if there was no search."""
+    """Text on the search for a PSNR: what was reached, and its cost; empty if there was no
+    search."""
     judge: Judge | None = None
     """The judge of a search for a PSNR; None if there was no search."""
     interrupted: bool = False
@@ -116,7 +118,9 @@ class Compacted:
         stage = self._stage("photos")
         if stage is None or stage.photos is None:
             return None
-        return PhotoGain(stage.photos.before, stage.photos.after, stage.photos.compared, stage.accepted)
+        return PhotoGain(
+            stage.photos.before, stage.photos.after, stage.photos.compared, stage.accepted
+        )
 
     @property
     def before(self) -> Closeness | None:
@@ -125,8 +129,8 @@ class Compacted:
 
     @property
     def psnr(self) -> float | None:
-        """PSNR of ``scene`` against the dense scene's renders over the pixels that the dense scene covers, dB; None if
-        nothing was compared."""
+        """PSNR of ``scene`` against the dense scene's renders over the pixels that the dense scene
+        covers, dB; None if nothing was compared."""
         return None if self.last.after is None else self.last.after.psnr
 
     @property
@@ -136,14 +140,17 @@ class Compacted:
 
     @property
     def verdict(self) -> str:
-        """A line of text for each stage after pruning: its gain, or the reason to leave it out. One line if there is no
-        such stage."""
+        """A line of text for each stage after pruning: its gain, or the reason to leave it out. One
+        line if there is no such stage."""
         lines = [stage_text(stage) for stage in self.stages[1:]]
         if lines:
             return "\n".join(lines)
         if self.before is None:
             return f"not refined or repaired: {self.uncompared}"
-        return f"not repaired: {self.before.psnr:.1f} dB PSNR against the dense scene ({self.before.where})"
+        return (
+            f"not repaired: {self.before.psnr:.1f} dB PSNR against the dense scene "
+            f"({self.before.where})"
+        )
 
 
 def last_kept(stages: Sequence[Stage]) -> Stage:
@@ -153,20 +160,39 @@ def last_kept(stages: Sequence[Stage]) -> Stage:
 
 def stage_text(stage: Stage) -> str:
     """A line of text: what a stage gains, or the reason to leave it out."""
-    cost = f" by {counted(stage.steps, 'step')} in {stage.seconds:.1f} s" if stage.name in ("repair", "photos") else ""
+    cost = (
+        f" by {counted(stage.steps, 'step')} in {stage.seconds:.1f} s"
+        if stage.name in ("repair", "photos")
+        else ""
+    )
     cost += ", interrupted" if stage.interrupted else ""
-    done = stage.done + {"refine": " by the network", "round": " for the size of the file"}.get(stage.name, "")
+    done = stage.done + {"refine": " by the network", "round": " for the size of the file"}.get(
+        stage.name, ""
+    )
     if stage.photos is not None:
         done += f" on {stage.photos.used} photos"
-        figures = f"{stage.photos.before:.1f} -> {stage.photos.after:.1f} dB PSNR in {stage.photos.compared} photos"
+        figures = (
+            f"{stage.photos.before:.1f} -> {stage.photos.after:.1f} dB PSNR in "
+            f"{stage.photos.compared} photos"
+        )
     else:
-        figures = "" if stage.before is None or stage.after is None else _figures(stage.before, stage.after)
-    reason = f", {stage.reason}" if stage.reason and figures else stage.reason and f": {stage.reason}"
-    return f"{'' if stage.accepted else 'not '}{done}{cost}{reason}" + (f": {figures}" if figures else "")
+        figures = (
+            ""
+            if stage.before is None or stage.after is None
+            else _figures(stage.before, stage.after)
+        )
+    reason = (
+        f", {stage.reason}" if stage.reason and figures else stage.reason and f": {stage.reason}"
+    )
+    return f"{'' if stage.accepted else 'not '}{done}{cost}{reason}" + (
+        f": {figures}" if figures else ""
+    )
 
 
 def _figures(before: Closeness, after: Closeness) -> str:
     """Text with the errors before and after."""
     gain = f"{before.psnr:.1f} -> {after.psnr:.1f} dB PSNR against the dense scene"
-    worst = f"worst {before.worst:.1f} -> {after.worst:.1f} dB, better in {closer_in(before, after)}"
+    worst = (
+        f"worst {before.worst:.1f} -> {after.worst:.1f} dB, better in {closer_in(before, after)}"
+    )
     return f"{gain} ({before.where}; {worst})"

@@ -1,4 +1,5 @@
-"""Features of each Gaussian for the feedback network: its gradients so far, Adam's steps, and its parameters."""
+"""Features of each Gaussian for the feedback network: its gradients so far, Adam's steps, and its
+parameters."""
 
 from __future__ import annotations
 
@@ -20,28 +21,33 @@ class RepairSettings:
     """Settings of repairs. Rates, decays and damping are tuned for the shipped network."""
 
     adam: AdamSettings = AdamSettings(faster=8.0, betas=(0.8, 0.98), damping=0.5)
-    """The learning rates and decays of 3DGS suit 30,000 steps; repairs are shorter. Without damping, Adam moves all
-    Gaussians equally far, also correct ones with tiny gradients. Half the rates without damping gain as much where a
-    scene has errors, but disturb correct parts."""
+    """The learning rates and decays of 3DGS suit 30,000 steps; repairs are shorter. Without
+    damping, Adam moves all Gaussians equally far, also correct ones with tiny gradients. Half the
+    rates without damping gain as much where a scene has errors, but disturb correct parts."""
     fewest_steps: int = 6
-    """Least number of steps in the network's training; smaller numbers enter its features as this one."""
+    """Least number of steps in the network's training; smaller numbers enter its features as this
+    one."""
     most_steps: int = 32
-    """Largest number of steps in the network's training; larger numbers enter its features as this one."""
+    """Largest number of steps in the network's training; larger numbers enter its features as this
+    one."""
     nearly_right: float = 35.0
-    """PSNR over the pixels that the dense scene covers, in dB, above which the learning rates fall with the root mean
-    square error, see :func:`~pointsplat_ns.compression.repair.initial_rate_factor`. Full steps disturb a nearly correct
-    scene. Gains in dB with reduced and with full rates: half of a kettle at 44 dB 1.7 and 0.2, half of a cake at 42 dB
-    2.0 and 0.3, half of a room at 40 dB 1.2 and 0. Up to 36 dB, full rates gain most. Tuned on a bouquet, a cake, a
-    kettle, a statue and two rooms."""
+    """PSNR over the pixels that the dense scene covers, in dB, above which the learning rates fall
+    with the root mean square error, see
+    :func:`~pointsplat_ns.compression.repair.initial_rate_factor`. Full steps disturb a nearly
+    correct scene. Gains in dB with reduced and with full rates: half of a kettle at 44 dB 1.7 and
+    0.2, half of a cake at 42 dB 2.0 and 0.3, half of a room at 40 dB 1.2 and 0. Up to 36 dB, full
+    rates gain most. Tuned on a bouquet, a cake, a kettle, a statue and two rooms."""
     last_factor: float = 0.02
-    """Factor on the learning rates at the last step, see :func:`~pointsplat_ns.compression.repair.rate_factor`."""
+    """Factor on the learning rates at the last step, see
+    :func:`~pointsplat_ns.compression.repair.rate_factor`."""
 
 
 REPAIR = RepairSettings()
 
 
 class Feedback(Adam):
-    """Adam, with the features of each Gaussian from which a network chooses the length of its steps.
+    """Adam, with the features of each Gaussian from which a network chooses the length of its
+    steps.
 
     Args:
         scene: K Gaussians, at the start.
@@ -74,9 +80,12 @@ class Feedback(Adam):
         return {**super().state(), "visibility": self._visibility}
 
     @torch.no_grad()
-    def factors(self, network: Callable[[Tensor], Tensor], scene: Gaussians, done: float, steps: int) -> Tensor:
-        """Factors (K, 6) of the steps that a network makes of :meth:`features`, which has the other arguments. It gets
-        pieces that stay in a core's cache, each on one thread: the result is the same on any number of threads."""
+    def factors(
+        self, network: Callable[[Tensor], Tensor], scene: Gaussians, done: float, steps: int
+    ) -> Tensor:
+        """Factors (K, 6) of the steps that a network makes of :meth:`features`, which has the other
+        arguments. It gets pieces that stay in a core's cache, each on one thread: the result is the
+        same on any number of threads."""
         found = scene.means.new_empty(len(scene), len(PARAMETERS))
 
         def fill(rows: slice) -> None:
@@ -87,14 +96,19 @@ class Feedback(Adam):
         return found
 
     @torch.no_grad()
-    def features(self, scene: Gaussians, done: float, steps: int, rows: slice = slice(None)) -> Tensor:
+    def features(
+        self, scene: Gaussians, done: float, steps: int, rows: slice = slice(None)
+    ) -> Tensor:
         """Features of each Gaussian, of order 1.
 
-        - for each parameter, over its components: logarithm of the root mean square gradient in units of the damping;
-          norm of the mean gradient over it; logarithm of the last gradient over it
+        - for each parameter, over its components: logarithm of the root mean square gradient in
+          units of the damping; norm of the mean gradient over it; logarithm of the last gradient
+          over it
         - Adam's steps for scales, opacity and colour
-        - opacity, size relative to the median Gaussian, shape, colour, share of views in which it is visible
-        - the same for all Gaussians: share of the steps done, logarithms of the number of steps and of the share kept
+        - opacity, size relative to the median Gaussian, shape, colour, share of views in which it
+          is visible
+        - the same for all Gaussians: share of the steps done, logarithms of the number of steps and
+          of the share kept
 
         Args:
             scene: K Gaussians before the step.
@@ -105,7 +119,9 @@ class Feedback(Adam):
         Returns:
             (K, 39) float32, finite.
         """
-        scales, opacities, colours = (values[rows] for values in (scene.scales, scene.opacities, scene.features_dc))
+        scales, opacities, colours = (
+            values[rows] for values in (scene.scales, scene.opacities, scene.features_dc)
+        )
         columns: list[Tensor] = []
         least = 1e-3  # share of the damping that is added to denominators
         for name in PARAMETERS:
@@ -113,14 +129,23 @@ class Feedback(Adam):
                 columns.append(scales.new_zeros(len(scales), 3))
                 continue
             unit = self._epsilon(name)
-            size = (self._second[name][rows] / self._weight_sum(1)).flatten(1).mean(1, keepdim=True).sqrt()
-            mean, last = _rms(self._first[name][rows] / self._weight_sum(0)), _rms(self._gradients[name][rows])
+            size = (
+                (self._second[name][rows] / self._weight_sum(1))
+                .flatten(1)
+                .mean(1, keepdim=True)
+                .sqrt()
+            )
+            mean = _rms(self._first[name][rows] / self._weight_sum(0))
+            last = _rms(self._gradients[name][rows])
             columns += [
                 torch.log10(size / unit + 1e-4) / 2,
                 mean / (size + least * unit),
                 torch.log10(last / (size + least * unit) + 1e-2) / 2,
             ]
-        columns += [self._directions[name][rows].clamp(-3, 3) for name in ("scales", "opacities", "features_dc")]
+        columns += [
+            self._directions[name][rows].clamp(-3, 3)
+            for name in ("scales", "opacities", "features_dc")
+        ]
         scales = _bounded(scales)
         mean = scales.mean(1, keepdim=True)
         columns += [

@@ -1,8 +1,8 @@
 """Optimises the parameters of a scene by Adam, so that its renders match target images.
 
-The loss of a view is 0.8 RMSE + 0.2 (1 - SSIM). With L1 in place of the root mean squared error, as 3DGS has it, a
-tenth that is trained on photos has 0.16 dB less in held-out photos, at equal LPIPS (fox, figure, ray, drone_hall), and
-a repair has 0.09 dB less (three splats at 3 to 50 %).
+The loss of a view is 0.8 RMSE + 0.2 (1 - SSIM). With L1 in place of the root mean squared error, as
+3DGS has it, a tenth that is trained on photos has 0.16 dB less in held-out photos, at equal LPIPS
+(fox, figure, ray, drone_hall), and a repair has 0.09 dB less (three splats at 3 to 50 %).
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from pointsplat_ns.system.threads import in_turn, most_threads, one_thread, one_
 from pointsplat_ns.views import View
 
 RATES = {
-    "means": 1.6e-6,  # times the extent of the scene: the final rate of 3DGS, as the scene has been trained
+    # times the extent of the scene: the final rate of 3DGS, as the scene has been trained
+    "means": 1.6e-6,
     "scales": 5e-3,
     "quats": 1e-3,
     "opacities": 2.5e-2,
@@ -41,9 +42,9 @@ Choose = Callable[[Gaussians], tuple[float, Tensor | None]]
 """From the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`."""
 
 TOGETHER = 2
-"""Views whose gradients are computed at once, on a thread each, of one scene; then a step follows for each. Held-out
-photos lose nothing by two (fox, vr_project), and a repair 0.01 to 0.05 dB (three splats at 3 to 50 %). With four, a
-repair loses up to 0.16 dB."""
+"""Views whose gradients are computed at once, on a thread each, of one scene; then a step follows
+for each. Held-out photos lose nothing by two (fox, vr_project), and a repair 0.01 to 0.05 dB (three
+splats at 3 to 50 %). With four, a repair loses up to 0.16 dB."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ class AdamSettings:
     betas: tuple[float, float] = (0.9, 0.999)
     """Decays of the averages of the gradient and of its square."""
     damping: float = 0.0
-    """Adam's epsilon for each parameter, as a share of the root mean square of its nonzero gradients in the first step
-    that has any. 0 leaves an epsilon of 1e-15."""
+    """Adam's epsilon for each parameter, as a share of the root mean square of its nonzero
+    gradients in the first step that has any. 0 leaves an epsilon of 1e-15."""
 
 
 class Adam:
@@ -65,13 +66,19 @@ class Adam:
     Args:
         scene: K Gaussians, at the start.
         settings: decays and damping.
-        rates: learning rates by parameter name; that of the means is multiplied by the extent of the scene.
+        rates: learning rates by parameter name; that of the means is multiplied by the extent of
+            the scene.
     """
 
-    def __init__(self, scene: Gaussians, settings: AdamSettings, rates: Mapping[str, float] = RATES):
+    def __init__(
+        self, scene: Gaussians, settings: AdamSettings, rates: Mapping[str, float] = RATES
+    ):
         self.reach = extent(scene)
         """Extent of the scene at the start, scene units."""
-        self.rates = {name: settings.faster * rates[name] * (self.reach if name == "means" else 1.0) for name in RATES}
+        self.rates = {
+            name: settings.faster * rates[name] * (self.reach if name == "means" else 1.0)
+            for name in RATES
+        }
         self._settings = settings
         self._first = {name: value.new_zeros(value.shape) for name, value in scene.items()}
         self._second = {name: value.new_zeros(value.shape) for name, value in scene.items()}
@@ -90,7 +97,9 @@ class Adam:
             self._first[name].lerp_(gradient, 1 - beta)
             self._second[name].mul_(square_beta).addcmul_(gradient, gradient, value=1 - square_beta)
             root = (self._second[name] / self._weight_sum(1)).sqrt_()
-            self._directions[name] = (self._first[name] / self._weight_sum(0)).div_(root.add_(self._epsilon(name)))
+            self._directions[name] = (self._first[name] / self._weight_sum(0)).div_(
+                root.add_(self._epsilon(name))
+            )
 
     def moves(self, share: float, factors: Tensor | None = None) -> dict[str, Tensor]:
         """The step of each parameter: Adam's step times factors.
@@ -107,15 +116,17 @@ class Adam:
             moves[name] = step * (-share * self.rates[name])
         return moves
 
-    def moved(self, scene: Gaussians, share: float = 1.0, factors: Tensor | None = None) -> Gaussians:
+    def moved(
+        self, scene: Gaussians, share: float = 1.0, factors: Tensor | None = None
+    ) -> Gaussians:
         """A scene after a step; arguments as for :meth:`moves`."""
         moves = self.moves(share, factors)
         return scene.replace(**{name: value + moves[name] for name, value in scene.items()})
 
     @torch.no_grad()
     def stepped(self, scene: Gaussians, gradients: dict[str, Tensor], choose: Choose) -> Gaussians:
-        """A scene after a step: :meth:`observe`, then :meth:`moved` with the arguments that are chosen of the scene; in
-        one pass, by a compiled kernel, where it was built."""
+        """A scene after a step: :meth:`observe`, then :meth:`moved` with the arguments that are
+        chosen of the scene; in one pass, by a compiled kernel, where it was built."""
         share, factors = choose(scene)
         if not KERNELS.usable_for(None, *scene.tensors()):
             self.observe(gradients)
@@ -127,38 +138,59 @@ class Adam:
         for kind, (name, values) in enumerate(scene.items()):
             self._damp(name, gradients[name])
             task = KERNELS.structs["AdamStep"](
-                values=values.contiguous(), gradient=gradients[name].contiguous(), first=self._first[name],
-                second=self._second[name], moved=moved[name], factors=factors, count=len(values),
-                columns=values[:1].numel(), kind=kind, kinds=len(RATES), rate=share * self.rates[name],
-                epsilon=self._epsilon(name), fresh=1 - beta, kept_square=square_beta, fresh_square=1 - square_beta,
-                weight_sum=self._weight_sum(0), square_weight_sum=self._weight_sum(1),
-            )  # fmt: skip
+                values=values.contiguous(),
+                gradient=gradients[name].contiguous(),
+                first=self._first[name],
+                second=self._second[name],
+                moved=moved[name],
+                factors=factors,
+                count=len(values),
+                columns=values[:1].numel(),
+                kind=kind,
+                kinds=len(RATES),
+                rate=share * self.rates[name],
+                epsilon=self._epsilon(name),
+                fresh=1 - beta,
+                kept_square=square_beta,
+                fresh_square=1 - square_beta,
+                weight_sum=self._weight_sum(0),
+                square_weight_sum=self._weight_sum(1),
+            )
             on_threads(len(values) >= SEVERAL, KERNELS.library.pointsplat_adam, task)
         return scene.replace(**moved)
 
     def state(self) -> dict[str, Tensor]:
         """What the next steps depend on, by name: the averages themselves, and the damping."""
         averages = {"first": self._first, "second": self._second}
-        state = {f"{which}.{name}": value for which, kind in averages.items() for name, value in kind.items()}
+        state = {
+            f"{which}.{name}": value
+            for which, kind in averages.items()
+            for name, value in kind.items()
+        }
         return {**state, "damping": torch.tensor([*self._damping.values()], **DOUBLES)}
 
     def restore(self, state: Mapping[str, Tensor], steps: int) -> None:
         """Take over the state after some steps, from tensors of the shapes of :meth:`state`."""
-        self._steps, self._damping = steps, dict(zip(RATES, state["damping"].tolist(), strict=True))
+        self._steps = steps
+        self._damping = dict(zip(RATES, state["damping"].tolist(), strict=True))
         for name, value in self.state().items():
             value.copy_(state[name])
 
     def root_mean_square(self, name: str) -> Tensor:
-        """Root of the mean square of the gradients by a parameter so far, (K,): over steps, summed over components."""
+        """Root of the mean square of the gradients by a parameter so far, (K,): over steps, summed
+        over components."""
         return (self._second[name] / self._weight_sum(1)).flatten(1).sum(1).sqrt()
 
     def _weight_sum(self, which: int) -> float:
-        """The sum of the weights in an average, for bias correction; ``which`` indexes ``betas``."""
+        """The sum of the weights in an average, for bias correction; ``which`` indexes
+        ``betas``."""
         return 1 - self._settings.betas[which] ** self._steps
 
     def _damp(self, name: str, gradient: Tensor) -> None:
         if self._settings.damping:
-            self._damping[name] = self._damping[name] or self._settings.damping * nonzero_rms(gradient)
+            self._damping[name] = self._damping[name] or self._settings.damping * nonzero_rms(
+                gradient
+            )
 
     def _epsilon(self, name: str) -> float:
         return max(self._damping[name], 1e-15)
@@ -172,8 +204,8 @@ def optimised(
     pixel_loss: PixelLoss = "rmse",
     together: int = TOGETHER,
 ) -> Iterator[Gaussians]:
-    """Yield the scene after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale
-    of a flat axis) do not change.
+    """Yield the scene after each step, without end. Values that are not finite (the logit of
+    opacity 1, the log-scale of a flat axis) do not change.
 
     Args:
         scene: K Gaussians; not changed.
@@ -199,8 +231,9 @@ def optimised(
 
 
 def extent(scene: Gaussians) -> float:
-    """The 90 % quantile of the distances from the median position along each axis, scene units; 1 if all Gaussians are
-    in one place. One distant Gaussian does not change it, as it would change a mean."""
+    """The 90 % quantile of the distances from the median position along each axis, scene units; 1
+    if all Gaussians are in one place. One distant Gaussian does not change it, as it would change a
+    mean."""
     means = scene.means.detach().double()
     with one_thread():
         return float((means - means.median(0).values).norm(dim=1).quantile(0.9)) or 1.0
@@ -208,19 +241,22 @@ def extent(scene: Gaussians) -> float:
 
 @torch.no_grad()
 def size_factors(scene: Gaussians, reach: float) -> Tensor:
-    """Factors for :meth:`Adam.moves` that make the rate of the means a share of a Gaussian's own size: of its middle
-    standard deviation. The other rates stay.
+    """Factors for :meth:`Adam.moves` that make the rate of the means a share of a Gaussian's own
+    size: of its middle standard deviation. The other rates stay.
 
     Args:
         scene: K Gaussians.
-        reach: extent of the scene when ``Adam`` was made, scene units; a larger size counts as this.
+        reach: extent of the scene when ``Adam`` was made, scene units; a larger size counts as
+            this.
 
     Returns:
         (K, 6).
     """
     factors = scene.means.new_ones(len(scene), len(RATES))
     a, b, c = scene.scales.unbind(1)
-    middle = torch.maximum(torch.minimum(a, b), torch.minimum(torch.maximum(a, b), c)).clamp(max=math.log(reach))
+    middle = torch.maximum(torch.minimum(a, b), torch.minimum(torch.maximum(a, b), c)).clamp(
+        max=math.log(reach)
+    )
     factors[:, list(RATES).index("means")] = (middle - math.log(reach)).exp().nan_to_num(0.0)
     return factors
 
@@ -233,7 +269,8 @@ def gradients_of(
     backend: Literal["torch", "auto"] = "torch",
     pixel_loss: PixelLoss = "rmse",
 ) -> dict[str, Tensor]:
-    """Gradients of the loss of one view by parameter. A gradient is 0 where it or the value itself is not finite.
+    """Gradients of the loss of one view by parameter. A gradient is 0 where it or the value itself
+    is not finite.
 
     Args:
         scene: K Gaussians.
@@ -247,8 +284,12 @@ def gradients_of(
     with torch.enable_grad():
         image = render(leaves, view, backend=backend)
         _loss(*Example(view, target, mask).compared(image), pixel_loss).backward()
-    gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in leaves.items()}
-    # Sums are finite where all numbers are, nearly always, and take a tenth of the time of looking at each.
+    gradients = {
+        name: torch.zeros_like(value) if value.grad is None else value.grad
+        for name, value in leaves.items()
+    }
+    # Sums are finite where all numbers are, nearly always, and take a tenth of the time of looking
+    # at each.
     sums = torch.stack([value.detach().sum() for value in (*leaves.tensors(), *gradients.values())])
     if not bool(sums.isfinite().all()):
         for name, value in leaves.items():

@@ -30,13 +30,15 @@ def plot_comparison(
     files: Sequence[str] = ("", ""),
     quality: Quality | None = None,
 ) -> str:
-    """Draw three of the compared views: the dense scene, and the scene after each stage, side by side.
+    """Draw three of the compared views: the dense scene, and the scene after each stage, side by
+    side.
 
     Args:
         dense: the scene that was compacted.
         result: the result of :func:`pointsplat_ns.compact`.
         path: the PNG file to write.
-        files: text on the files of the dense scene and of the result, such as "room.ply, 7.42 MB", for their titles.
+        files: text on the files of the dense scene and of the result, such as "room.ply, 7.42 MB",
+            for their titles.
         quality: of the result's file, for its title.
 
     Returns:
@@ -57,17 +59,26 @@ def plot_comparison(
     """
     if result.reference is None:
         return f"{path}: not drawn, because there are no views"
-    views, renders = result.reference.views, result.reference.renders
+    views = result.reference.views
+    renders = result.reference.renders
     rows_of = spread_indices(len(views), 3)
-    names, titles, scenes = ["dense"], [_title("dense", dense, files[0])], []
+    names = ["dense"]
+    titles = [_title("dense", dense, files[0])]
+    scenes = []
     for stage in result.stages:
         if stage.after is not None:
             names.append(stage.done if stage.accepted else f"{stage.done} (left out)")
             last = stage is result.last
-            said = [files[1], "" if quality is None else re.sub("[:;] ", "\n", str(quality))] if last else []
+            said = (
+                [files[1], "" if quality is None else re.sub("[:;] ", "\n", str(quality))]
+                if last
+                else []
+            )
             titles.append(_title(names[-1], stage.scene, *said))
             scenes.append(stage.scene)
-    rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in rows_of]
+    rows = [
+        [renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in rows_of
+    ]
     side_by_side(rows, titles, path)
     return f"{path}: {', '.join(names)}, side by side"
 
@@ -98,34 +109,46 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
     rows = [pictures[first : first + columns] for first in range(0, len(pictures), columns)]
     rows[-1] += [torch.ones_like(pictures[0])] * (columns - len(rows[-1]))
     side_by_side(rows, [""] * columns, path)
-    return f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; {source.origin}"
+    return (
+        f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; "
+        f"{source.origin}"
+    )
 
 
 @torch.no_grad()
-def plot_cleaning(dense: Gaussians, gone: Gaussians, cleaned: Gaussians, views: Views, path: Path | str) -> None:
-    """Draw the three of some views in which most pixels go: the dense scene; what goes, before the scene in grey, the
-    ten largest clusters in colours of their own; and the cleaned scene. ``gone`` may hold what cannot be drawn."""
+def plot_cleaning(
+    dense: Gaussians, gone: Gaussians, cleaned: Gaussians, views: Views, path: Path | str
+) -> None:
+    """Draw the three of some views in which most pixels go: the dense scene; what goes, before the
+    scene in grey, the ten largest clusters in colours of their own; and the cleaned scene. ``gone``
+    may hold what cannot be drawn."""
     from matplotlib import colormaps
 
     gone = gone[gone.usable()]
     colors = torch.from_numpy(colormaps["tab10"](np.arange(10))[:, :3])[clusters(gone).clamp_max(9)]
     marked = gone.replace(
-        features_dc=((colors - 0.5) / SH_C0).to(gone.means), features_rest=torch.zeros_like(gone.features_rest)
+        features_dc=((colors - 0.5) / SH_C0).to(gone.means),
+        features_rest=torch.zeros_like(gone.features_rest),
     )
     views = dataclasses.replace(views, background=torch.zeros_like(views.background))
     shares = torch.stack([render_with_alpha(marked, view)[1].sum() for view in views])
     rows = []
     for view in views[shares.argsort(descending=True, stable=True)[:3].cpu()]:
-        before, (over, alpha) = render(dense, view), render_with_alpha(marked, view)
+        before = render(dense, view)
+        (over, alpha) = render_with_alpha(marked, view)
         grey = 0.2 + 0.5 * before.mean(-1, keepdim=True).expand_as(before)
         rows.append([before.cpu(), (over + (1 - alpha) * grey).cpu(), render(cleaned, view).cpu()])
-    titles = [f"{len(dense):,} Gaussians", f"{len(dense) - len(cleaned):,} go", f"{len(cleaned):,} stay"]
+    titles = [
+        f"{len(dense):,} Gaussians",
+        f"{len(dense) - len(cleaned):,} go",
+        f"{len(cleaned):,} stay",
+    ]
     side_by_side(rows, titles, path)
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:
-    """Draw a grid of images (H, W, 3) in [0, 1] of one size to a PNG file, with a title above each column, also in the
-    file's description. Raises SceneError if the file cannot be written."""
+    """Draw a grid of images (H, W, 3) in [0, 1] of one size to a PNG file, with a title above each
+    column, also in the file's description. Raises SceneError if the file cannot be written."""
     from matplotlib.figure import Figure
 
     height, width = np.shape(rows[0][0])[:2]

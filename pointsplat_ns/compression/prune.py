@@ -1,7 +1,7 @@
 """Pruning with all options: cleaning and SH bands first, then a method and a budget.
 
-Views are read or sampled only where they are needed: for a budget in dB, ``auto`` SH, a method that scores by views,
-or cleaning that removes a Gaussian.
+Views are read or sampled only where they are needed: for a budget in dB, ``auto`` SH, a method that
+scores by views, or cleaning that removes a Gaussian.
 """
 
 from __future__ import annotations
@@ -13,7 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pointsplat_ns.comparing.closeness import DenseReference, views_text
-from pointsplat_ns.compression.budget_search import FileLimit, largest_within, share_done, smallest_within
+from pointsplat_ns.compression.budget_search import (
+    FileLimit,
+    largest_within,
+    share_done,
+    smallest_within,
+)
 from pointsplat_ns.compression.cleaning import clean_scene
 from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.requests import PruneRequest
@@ -55,14 +60,18 @@ def prune_scene(
     progress: Progress = silent,
     rounding: bool = True,
 ) -> Pruned:
-    """Make a scene smaller, by default with sampled views. Its numbers are rounded for the size of a
-    compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met, SceneError if no
-    Gaussian of the scene can be drawn, and DataError if views are needed and there are none."""
+    """Make a scene smaller, by default with sampled views. Its numbers are rounded for the size of
+    a compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met,
+    SceneError if no Gaussian of the scene can be drawn, and DataError if views are needed and there
+    are none."""
     need_usable(dense)
     views = views or ViewSource(dense)
     full, about_sh = _with_sh(dense, request.sh, views, progress)
     count = request.count_of(len(full), full.sh_degree, full.traits)
-    start, cleaning, limit, searched = full, None, None, ""
+    start = full
+    cleaning = None
+    limit = None
+    searched = ""
     if request.clean:
         cleaning = clean_scene(dense, count or 1, views, progress)
         start = cleaning.apply(full, count or 1)
@@ -72,7 +81,9 @@ def prune_scene(
     if count is not None and merging:
         scene = merge(start, count, report, views.for_merging()).scene
     elif count is not None:
-        scene = start[select(score_of(start, request.method, scored, request.opacity_weight, report), count)]
+        scene = start[
+            select(score_of(start, request.method, scored, request.opacity_weight, report), count)
+        ]
     else:
         if merging:
             merger = Merger(start, views.for_merging())
@@ -99,17 +110,24 @@ def prune_scene(
     return Pruned(scene, notes, limit)
 
 
-def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -> tuple[Gaussians, str]:
-    """The scene with the SH bands that ``sh`` keeps, and a line on them; an empty one if it keeps all."""
+def _with_sh(
+    dense: Gaussians, sh: str, views: ViewSource, progress: Progress
+) -> tuple[Gaussians, str]:
+    """The scene with the SH bands that ``sh`` keeps, and a line on them; an empty one if it keeps
+    all."""
     if sh == "all":
         return dense, ""
     reached = ""
     if sh == "auto":
         progress("comparing SH degrees", 0.0)
         reference = DenseReference(dense, views.compared())
-        psnrs = ((degree, reference.psnr(cut_sh(dense, degree))[0]) for degree in range(dense.sh_degree))
+        psnrs = (
+            (degree, reference.psnr(cut_sh(dense, degree))[0]) for degree in range(dense.sh_degree)
+        )
         # An independent error of 40 dB lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB.
-        degree, psnr = next((pair for pair in psnrs if pair[1] >= 40.0), (dense.sh_degree, math.inf))
+        degree, psnr = next(
+            (pair for pair in psnrs if pair[1] >= 40.0), (dense.sh_degree, math.inf)
+        )
         if math.isfinite(psnr):
             reached = f", {psnr:.1f} dB PSNR against all bands"
     else:
@@ -128,14 +146,21 @@ def _for_psnr(
     views: ViewSource,
     progress: Callable[[float], None],
 ) -> tuple[Gaussians, FileLimit | None, str]:
-    """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit of its file: the
-    scene has the PSNR when it is rounded; and a line on the search. ``make(n)`` returns n Gaussians."""
-    judge, kind = Judge(dense, views), format_to_write(budget.suffix)
-    limit = None if kind.rounded is None else FileLimit(kind, math.inf, rounding_for(budget.value, dense.sh_degree))
+    """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit
+    of its file: the scene has the PSNR when it is rounded; and a line on the search. ``make(n)``
+    returns n Gaussians."""
+    judge = Judge(dense, views)
+    kind = format_to_write(budget.suffix)
+    limit = (
+        None
+        if kind.rounded is None
+        else FileLimit(kind, math.inf, rounding_for(budget.value, dense.sh_degree))
+    )
     numbers = itertools.count()
 
     def measure(count: int) -> tuple[float, tuple[Gaussians, float, float]]:
-        scene, before = make(count), next(numbers)
+        scene = make(count)
+        before = next(numbers)
         _, written = through_file(scene if limit is None else limit.rounded(scene), budget.suffix)
         psnr, worst = judge.psnr(written, lambda share: progress(share_done(before + share)))
         return psnr, (scene, psnr, worst)
@@ -156,8 +181,8 @@ def _for_size(
     views: ViewSource,
     progress: Callable[[float], None],
 ) -> tuple[Gaussians, FileLimit, str]:
-    """The largest scene whose compressed file has a size, before rounding, the rounding, and a line on the search;
-    ``start`` is the largest scene allowed, ``make(n)`` returns n Gaussians."""
+    """The largest scene whose compressed file has a size, before rounding, the rounding, and a line
+    on the search; ``start`` is the largest scene allowed, ``make(n)`` returns n Gaussians."""
     limit = FileLimit(format_to_write(budget.suffix), budget.bytes)
     try:
         reference = DenseReference(dense, views.compared())
@@ -165,4 +190,8 @@ def _for_size(
     except DataError:  # no views
         found = largest_within(start, make, limit, progress)
     scene, rounded, tries = found
-    return scene, rounded, f"{counted(tries, 'size')} tried for {bytes_text(limit.most)} as {limit.kind.name}"
+    return (
+        scene,
+        rounded,
+        f"{counted(tries, 'size')} tried for {bytes_text(limit.most)} as {limit.kind.name}",
+    )

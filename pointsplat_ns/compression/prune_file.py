@@ -38,8 +38,8 @@ class MemorySettings:
     base: int = 900_000_000
     """Bytes of the interpreter, torch and a thinned scene."""
     most: int = 4_000_000
-    """Largest number of Gaussians in a cell. More memory than it needs changes nothing, so that a result does not
-    depend on the memory that happens to be free."""
+    """Largest number of Gaussians in a cell. More memory than it needs changes nothing, so that a
+    result does not depend on the memory that happens to be free."""
     least: int = 100_000
     """Smallest number of Gaussians in a cell."""
 
@@ -47,9 +47,11 @@ class MemorySettings:
 MEMORY = MemorySettings()
 
 
-def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = None) -> PlyRows | None:
-    """The rows of a PLY that has to be merged in cells; None if it is pruned in memory: it fits, or options need it
-    whole.
+def rows_to_prune(
+    scene: Path, request: PruneRequest, memory: float | None = None
+) -> PlyRows | None:
+    """The rows of a PLY that has to be merged in cells; None if it is pruned in memory: it fits, or
+    options need it whole.
 
     Args:
         scene: path of a scene.
@@ -67,8 +69,8 @@ def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = Non
     if rows is None:
         if memory is not None:
             raise SceneError(
-                f"{scene}: is read as a whole; expected a binary 3DGS PLY for a limit of memory, which "
-                "`pointsplat convert` makes"
+                f"{scene}: is read as a whole; expected a binary 3DGS PLY for a limit of memory, "
+                "which `pointsplat convert` makes"
             )
         return None
     size = rows.count * (_row_bytes(rows) + MEMORY.cell)
@@ -84,7 +86,8 @@ def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = Non
     needing = [name for name, given in asked.items() if given]
     if needing and memory is not None:
         raise PointSplatError(
-            f"{scene}: {rows.count:,} Gaussians take {bytes_text(size)} of memory with {', '.join(needing)}; expected "
+            f"{scene}: {rows.count:,} Gaussians take {bytes_text(size)} of memory with "
+            f"{', '.join(needing)}; expected "
             "more memory, or merging without these options, which goes by parts"
         )
     if needing:
@@ -103,7 +106,8 @@ def prune_file(
     progress: Progress = silent,
     jobs: int = 1,
 ) -> tuple[int, float]:
-    """Merge a PLY cell by cell. A call that was killed resumes where it was, from a hidden folder beside the output.
+    """Merge a PLY cell by cell. A call that was killed resumes where it was, from a hidden folder
+    beside the output.
 
     Args:
         rows: the scene, as of :func:`rows_to_prune`.
@@ -119,7 +123,8 @@ def prune_file(
 
     Raises:
         PointSplatError: if the memory is too small.
-        SceneError: if a file cannot be read or written, or the disk has no room for what lies between.
+        SceneError: if a file cannot be read or written, or the disk has no room for what lies
+            between.
         BudgetError: if the budget does not fit the scene.
         DataError: if the cameras are not usable, or the number of jobs is not valid.
     """
@@ -127,8 +132,8 @@ def prune_file(
     check_jobs(jobs)
     if output.suffix.lower() != ".ply":
         raise SceneError(
-            f"{output}: is written as a whole; expected a .ply for a scene larger than memory, which "
-            "`pointsplat convert` changes"
+            f"{output}: is written as a whole; expected a .ply for a scene larger than memory, "
+            "which `pointsplat convert` changes"
         )
     if request.sh.isdigit():
         rows = copy.copy(rows)
@@ -139,7 +144,8 @@ def prune_file(
         needed = MEMORY.base + MEMORY.least * each
         if memory < needed:
             raise PointSplatError(
-                f"memory of {bytes_text(memory)} is too small; expected at least {bytes_text(needed)}"
+                f"memory of {bytes_text(memory)} is too small; expected at least "
+                f"{bytes_text(needed)}"
             )
         most = min(most, int((memory - MEMORY.base) / each))
     given = None if poses is None or without_poses(poses) else poses
@@ -149,10 +155,18 @@ def prune_file(
         known = known.resized(max(resolution))
     status = rows.path.stat()
     work = {
-        "scene": str(rows.path.resolve()), "bytes": status.st_size, "changed": status.st_mtime_ns, "rest": rows.rest,
-        "keep": str(request.keep), "most": most, "views": _digest(known), "resolution": list(resolution or RESOLUTION),
-        "up": None if up is None else up.direction.tolist(), "settings": repr(MERGING), "version": 2,
-    }  # fmt: skip
+        "scene": str(rows.path.resolve()),
+        "bytes": status.st_size,
+        "changed": status.st_mtime_ns,
+        "rest": rows.rest,
+        "keep": str(request.keep),
+        "most": most,
+        "views": _digest(known),
+        "resolution": list(resolution or RESOLUTION),
+        "up": None if up is None else up.direction.tolist(),
+        "settings": repr(MERGING),
+        "version": 2,
+    }
 
     def views(sample: Gaussians) -> Views | None:
         if file is None or known is None:
@@ -166,10 +180,14 @@ def prune_file(
         return count
 
     count = count_of(rows.count)  # errors before the work
-    size = rows.count * (_row_bytes(rows) + 150) + count * _row_bytes(rows)  # 150 bytes for each between rounds
+    size = rows.count * (_row_bytes(rows) + 150) + count * _row_bytes(
+        rows
+    )  # 150 bytes for each between rounds
     scratch = Scratch(output.with_name(f".{output.name}.cells"), work, size)
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
-    before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress, jobs=jobs)
+    before, _ = merge_file(
+        rows, count_of, output, most, scratch, views, sampler, progress, jobs=jobs
+    )
     scratch.remove()
     return before, time.perf_counter() - start
 

@@ -1,8 +1,10 @@
-"""How close a written scene is to the dense scene: one judgement, which commands, pages and pictures say in one text.
+"""How close a written scene is to the dense scene: one judgement, which commands, pages and
+pictures say in one text.
 
-Renders are compared in the views of :meth:`~pointsplat_ns.view_source.ViewSource.whole`, at the size that
-people look at, in few of their pixels. For PSNR these are every k-th (:mod:`~pointsplat_ns.comparing.sizes`). SSIM
-needs neighbours, so it takes bands of rows of each view, at other heights in each.
+Renders are compared in the views of :meth:`~pointsplat_ns.view_source.ViewSource.whole`, at the
+size that people look at, in few of their pixels. For PSNR these are every k-th
+(:mod:`~pointsplat_ns.comparing.sizes`). SSIM needs neighbours, so it takes bands of rows of each
+view, at other heights in each.
 """
 
 from __future__ import annotations
@@ -38,8 +40,8 @@ WORDS = (
     (21.0, "small things are lost"),
     (0.0, "only large shapes are left"),
 )
-"""The plain word for a PSNR against the dense scene, dB, from its lower bound on: what was seen in pictures of rooms,
-statues, a robot and stones at 50, 30, 10 and 3 % of their Gaussians."""
+"""The plain word for a PSNR against the dense scene, dB, from its lower bound on: what was seen in
+pictures of rooms, statues, a robot and stones at 50, 30, 10 and 3 % of their Gaussians."""
 
 MOST_SAID = 60.0
 """PSNR from which on the text gives a bound, dB: the rounding of pictures to 256 levels has 59."""
@@ -52,8 +54,8 @@ class JudgingSettings:
     side: int = 240
     """Longer side of the subsampled picture for PSNR, pixels."""
     bands: int = 2
-    """Number of bands of rows for SSIM. It is within 0.01 of that of whole pictures in two rooms and a statue, 0.03 in
-    a robot on gravel; with one band within 0.03."""
+    """Number of bands of rows for SSIM. It is within 0.01 of that of whole pictures in two rooms
+    and a statue, 0.03 in a robot on gravel; with one band within 0.03."""
     band_rows: int = 13
     """Least number of rows of a band; SSIM takes windows of 11."""
     band_pixels: int = 24_960
@@ -79,7 +81,9 @@ class PhotoGain:
     def __str__(self) -> str:
         if self.kept:
             return f"{self.before:.1f} -> {self.after:.1f} dB in {self.photos} training photos"
-        return f"{self.before:.1f} dB in {self.photos} photos, which training on them does not raise"
+        return (
+            f"{self.before:.1f} dB in {self.photos} photos, which training on them does not raise"
+        )
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,8 @@ class Quality:
     worst: float
     """The same of the worst view, dB."""
     ssim: float | None
-    """SSIM, of which the loss is divided by the share of covered pixels, too; None for pictures below its window."""
+    """SSIM, of which the loss is divided by the share of covered pixels, too; None for pictures
+    below its window."""
     views: int
     """Number of views."""
     width: int
@@ -154,7 +159,9 @@ class Judge:
     """
 
     def __init__(self, dense: Gaussians, source: ViewSource):
-        self.dense, self.views, self.origin = dense, source.whole(), source.origin
+        self.dense = dense
+        self.views = source.whole()
+        self.origin = source.origin
         self.side = max(self.views.width, self.views.height)
 
     @property
@@ -164,7 +171,9 @@ class Judge:
 
     @cached_property
     def _pixels(self) -> DenseReference:
-        return DenseReference(self.dense, subsampled(self.views, self.side, min(self.side, JUDGING.side)))
+        return DenseReference(
+            self.dense, subsampled(self.views, self.side, min(self.side, JUDGING.side))
+        )
 
     @cached_property
     def _bands(self) -> DenseReference | None:
@@ -173,19 +182,24 @@ class Judge:
             return None
         rows = min(views.height, max(JUDGING.band_rows, JUDGING.band_pixels // views.width))
         views = views[torch.arange(len(views), **INDICES).repeat_interleave(JUDGING.bands)]
-        tops = (0.618 * torch.arange(len(views), **DOUBLES)).frac() * (views.height - rows)  # spread evenly
+        tops = (0.618 * torch.arange(len(views), **DOUBLES)).frac() * (
+            views.height - rows
+        )  # spread evenly
         Ks = views.Ks.clone()
         Ks[:, 1, 2] -= tops.round().to(Ks)
         return DenseReference(self.dense, replace(views, Ks=Ks, height=rows))
 
-    def psnr(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> tuple[float, float]:
+    def psnr(
+        self, scene: Gaussians, progress: Callable[[float], None] | None = None
+    ) -> tuple[float, float]:
         """PSNR of a scene over all views, and of the worst view, dB."""
         return self._pixels.psnr(self._placed(scene), progress)
 
     @one_thread_each()  # views are drawn at once, and what is left are small operations
     def quality(self, scene: Gaussians) -> Quality:
         """The judgement of a scene."""
-        (psnr, worst), similarity = self.psnr(scene), None
+        (psnr, worst) = self.psnr(scene)
+        similarity = None
         if self._bands is not None:
             covered = sum(self._bands.covered) / len(self._bands.covered)
             similarity = 1 - (1 - self._bands.ssim(self._placed(scene))) / (covered or 1.0)
@@ -214,14 +228,18 @@ def judge_of(dense: Gaussians, source: ViewSource) -> Judge | None:
 
 
 def read_back(scene: Gaussians, path: Path, kind: Format) -> Gaussians:
-    """The scene in a file of a format, which ``scene`` was written to; ``scene`` itself where nothing is lost, or
-    nothing reads the format."""
-    return scene if kind.suffix == ".ply" or kind.read is None else usable_part(kind.read(path)).to(scene.device)
+    """The scene in a file of a format, which ``scene`` was written to; ``scene`` itself where
+    nothing is lost, or nothing reads the format."""
+    return (
+        scene
+        if kind.suffix == ".ply" or kind.read is None
+        else usable_part(kind.read(path)).to(scene.device)
+    )
 
 
 def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
-    """The size of a scene's file of a suffix such as ``.spz`` in bytes, and the scene after writing and reading
-    (:func:`read_back`)."""
+    """The size of a scene's file of a suffix such as ``.spz`` in bytes, and the scene after writing
+    and reading (:func:`read_back`)."""
     kind = format_to_write(suffix)
     if kind.suffix == ".ply":
         return ply_bytes(len(scene), scene.sh_degree), scene

@@ -1,4 +1,5 @@
-"""Repairs a smaller scene by learned optimisation steps against renders of the dense scene, each in another view."""
+"""Repairs a smaller scene by learned optimisation steps against renders of the dense scene, each in
+another view."""
 
 from __future__ import annotations
 
@@ -23,7 +24,15 @@ from pointsplat_ns.photos.examples import Example, render_of
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 
-__all__ = ["STEPS", "Effort", "RepairBudget", "Repaired", "repair", "rate_factor", "initial_rate_factor"]
+__all__ = [
+    "STEPS",
+    "Effort",
+    "RepairBudget",
+    "Repaired",
+    "repair",
+    "rate_factor",
+    "initial_rate_factor",
+]
 
 
 @dataclass(frozen=True)
@@ -47,23 +56,27 @@ def repair(
     psnr: float = 0.0,
     unfinished: Path | None = None,
 ) -> Repaired:
-    """Optimise a smaller scene against renders of the dense one; its number of Gaussians does not change.
+    """Optimise a smaller scene against renders of the dense one; its number of Gaussians does not
+    change.
 
-    Each step renders both scenes in one view. A network reads the gradients of each Gaussian and sets how far it moves
-    (:mod:`~pointsplat_ns.refiner.feedback`). The views come from :meth:`ViewSource.others`: other views than those of
-    comparisons, each once before any is repeated. Ctrl-C ends the repair, and the scene of the last step is returned.
+    Each step renders both scenes in one view. A network reads the gradients of each Gaussian and
+    sets how far it moves (:mod:`~pointsplat_ns.refiner.feedback`). The views come from
+    :meth:`ViewSource.others`: other views than those of comparisons, each once before any is
+    repeated. Ctrl-C ends the repair, and the scene of the last step is returned.
 
     Args:
         scene: K Gaussians; not changed.
         dense: N Gaussians on the same device.
         views: source of views.
-        budget: length of the repair, for a scene of few Gaussians; see :meth:`RepairBudget.for_count`.
+        budget: length of the repair, for a scene of few Gaussians; see
+            :meth:`RepairBudget.for_count`.
         progress: called with the share done, in [0, 1].
         network: on the scene's device; by default the shipped one, None for plain Adam.
         psnr: PSNR of ``scene`` over the pixels that the dense scene covers, dB. Above
             ``REPAIR.nearly_right`` the steps are smaller.
-        unfinished: a file for the state of a repair of a number of steps, each minute. If it is there, and of the same
-            repair, the steps continue from it, to the same bits. The caller removes it.
+        unfinished: a file for the state of a repair of a number of steps, each minute. If it is
+            there, and of the same repair, the steps continue from it, to the same bits. The caller
+            removes it.
 
     Raises:
         DataError: if nothing of the scene is visible.
@@ -72,7 +85,8 @@ def repair(
     run = OptimisationRun(budget)
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
-    feedback, first_factor = Feedback(scene, len(dense)), budget.rate * initial_rate_factor(psnr)
+    feedback = Feedback(scene, len(dense))
+    first_factor = budget.rate * initial_rate_factor(psnr)
     work = len(dense), budget, psnr, views.compared().viewmats.tolist()
     file = Unfinished(None if budget.seconds is not None else unfinished, scene, work)
 
@@ -127,7 +141,10 @@ class OptimisationRun:
         return time.perf_counter() - self._start
 
     def take(
-        self, scene: Gaussians, scenes: Iterator[Gaussians], progress: Callable[[float], None] | None = None
+        self,
+        scene: Gaussians,
+        scenes: Iterator[Gaussians],
+        progress: Callable[[float], None] | None = None,
     ) -> Gaussians:
         """The scene after the last step: take steps until the budget is used, or Ctrl-C.
 
@@ -148,29 +165,35 @@ class OptimisationRun:
         return scene
 
 
-def _examples(dense: Gaussians, views: ViewSource, growth: float, taken: int = 0) -> Iterator[Callable[[], Example]]:
+def _examples(
+    dense: Gaussians, views: ViewSource, growth: float, taken: int = 0
+) -> Iterator[Callable[[], Example]]:
     """Views after those ``taken``, and renders of the dense scene in them, without end.
 
-    For ``growth`` times the steps, there are so many times the sampled views and pixels: a large scene has more
-    Gaussians between the pixels, and its projection takes most of the time. A view that comes again is not drawn again,
-    as long as it is among the last 256, or fewer of more pixels.
+    For ``growth`` times the steps, there are so many times the sampled views and pixels: a large
+    scene has more Gaussians between the pixels, and its projection takes most of the time. A view
+    that comes again is not drawn again, as long as it is among the last 256, or fewer of more
+    pixels.
     """
-    count, side = round(growth * VIEW_COUNTS.stepped), round(math.sqrt(growth) * SMALLEST_SIDE)
+    count = round(growth * VIEW_COUNTS.stepped)
+    side = round(math.sqrt(growth) * SMALLEST_SIDE)
 
-    drawn = functools.lru_cache(maxsize=round(256 / growth))(render_of)  # 0.2 GB where pictures are 16 to 9
+    drawn = functools.lru_cache(maxsize=round(256 / growth))(
+        render_of
+    )  # 0.2 GB where pictures are 16 to 9
     others = itertools.islice(views.others(count=count, drawn_side=side), taken, None)
     return (functools.partial(drawn, dense, view) for view in others)
 
 
 def rate_factor(done: float, last: float = REPAIR.last_factor) -> float:
-    """Factor on the learning rates when a share of the steps, in [0, 1], is done: a half cosine that falls from 1 to
-    ``last``."""
+    """Factor on the learning rates when a share of the steps, in [0, 1], is done: a half cosine
+    that falls from 1 to ``last``."""
     return last + (1 - last) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 def initial_rate_factor(psnr: float) -> float:
-    """Factor on all learning rates for a scene of some PSNR, dB: 1 up to ``REPAIR.nearly_right``, then proportional to
-    the root mean square error.
+    """Factor on all learning rates for a scene of some PSNR, dB: 1 up to ``REPAIR.nearly_right``,
+    then proportional to the root mean square error.
 
     Example:
         >>> [round(initial_rate_factor(psnr), 3) for psnr in (20, 35, 41, 55)]

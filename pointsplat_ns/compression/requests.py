@@ -1,4 +1,5 @@
-"""Requests: all options of pruning or of compacting in one object, checked before a scene is read."""
+"""Requests: all options of pruning or of compacting in one object, checked before a scene is
+read."""
 
 from __future__ import annotations
 
@@ -44,11 +45,12 @@ def default_device() -> torch.device:
 
 @dataclass(frozen=True)
 class RepairBudget:
-    """Length of a repair, in steps or seconds. Raises PointSplatError if it is not a positive time or one of
-    :data:`STEPS`."""
+    """Length of a repair, in steps or seconds. Raises PointSplatError if it is not a positive time
+    or one of :data:`STEPS`."""
 
     effort: Effort = "quick"
-    """Number of steps, see :data:`STEPS`. The result does not depend on the speed of the machine."""
+    """Number of steps, see :data:`STEPS`. The result does not depend on the speed of the
+    machine."""
     seconds: float | None = None
     """Wall-clock time, in place of ``effort``. The result depends on the speed of the machine."""
     growth: float = 1.0
@@ -68,9 +70,10 @@ class RepairBudget:
         return round(self.growth * STEPS[self.effort])
 
     def for_count(self, count: int) -> RepairBudget:
-        """The budget for a scene of ``count`` Gaussians. Steps grow with the root of the count, to four times as many:
-        a view shows more Gaussians of a large scene, and a smaller share of them. Of still more Gaussians, each is seen
-        in fewer steps, and moves as far in each, whatever the pixel: so the learning rates fall.
+        """The budget for a scene of ``count`` Gaussians. Steps grow with the root of the count, to
+        four times as many: a view shows more Gaussians of a large scene, and a smaller share of
+        them. Of still more Gaussians, each is seen in fewer steps, and moves as far in each,
+        whatever the pixel: so the learning rates fall.
 
         Example:
             >>> budgets = [RepairBudget().for_count(count) for count in (5_000, 80_000, 320_000, 3_200_000)]
@@ -87,8 +90,8 @@ class RepairBudget:
         return self.seconds == 0 if self.seconds is not None else self.steps == 0
 
     def share_done(self, steps: int, seconds: float) -> float:
-        """Used share of the budget after ``steps`` steps and ``seconds`` seconds; 1 or more at the end. The budget must
-        not be empty."""
+        """Used share of the budget after ``steps`` steps and ``seconds`` seconds; 1 or more at the
+        end. The budget must not be empty."""
         return seconds / self.seconds if self.seconds is not None else steps / self.steps
 
 
@@ -120,15 +123,17 @@ class PruneRequest:
     by: str = "merge"
     """One of :data:`~pointsplat_ns.pruning.METHODS`."""
     sh: str = "all"
-    """"all" keeps the SH bands, a digit cuts them to that degree, "auto" cuts them to the lowest degree whose renders
-    reach 40 dB against those with all bands."""
+    """"all" keeps the SH bands, a digit cuts them to that degree, "auto" cuts them to the lowest
+    degree whose renders reach 40 dB against those with all bands."""
     opacity_weight: float | None = None
     """Lambda of the methods that weigh opacity; None is the paper's value."""
     clean: bool = False
-    """Whether to remove Gaussians that no picture needs first (:mod:`~pointsplat_ns.compression.cleaning`). ``keep``
-    still refers to the dense scene, and the result has exactly that number of Gaussians."""
+    """Whether to remove Gaussians that no picture needs first
+    (:mod:`~pointsplat_ns.compression.cleaning`). ``keep`` still refers to the dense scene, and the
+    result has exactly that number of Gaussians."""
     suffix: str = ".ply"
-    """Suffix of the format of the result. A size or a PSNR in the text ``keep`` is for it, if it names none."""
+    """Suffix of the format of the result. A size or a PSNR in the text ``keep`` is for it, if it
+    names none."""
     budget: Keep = field(init=False)
     """``keep``, parsed if it is text."""
     method: Method = field(init=False)
@@ -142,10 +147,14 @@ class PruneRequest:
         object.__setattr__(self, "budget", budget)
 
     def count_of(self, n: int, sh_degree: int, traits: Traits = PLAIN) -> int | None:
-        """Number of Gaussians to keep of ``n``, which depends on the SH degree and traits of the result where it has
-        to fit a file; None if it needs a search (a PSNR, or the size of a compressed file). Raises BudgetError if the
-        budget does not fit the scene."""
-        return None if found_by_trying(self.budget) else resolve_keep(n, self.budget, sh_degree, traits)
+        """Number of Gaussians to keep of ``n``, which depends on the SH degree and traits of the
+        result where it has to fit a file; None if it needs a search (a PSNR, or the size of a
+        compressed file). Raises BudgetError if the budget does not fit the scene."""
+        return (
+            None
+            if found_by_trying(self.budget)
+            else resolve_keep(n, self.budget, sh_degree, traits)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +169,11 @@ class CompactRequest:
     photos: PhotoBudget | None = None
     """Length of the optimisation against photos; None for none."""
     target_db: float | None = None
-    """Least PSNR of the file against the dense scene's renders, dB, in place of the budget; None for none."""
+    """Least PSNR of the file against the dense scene's renders, dB, in place of the budget; None
+    for none."""
     most_lost: float | None = None
-    """Largest loss of PSNR of the file in held-out photos, dB, in place of the budget; None for none."""
+    """Largest loss of PSNR of the file in held-out photos, dB, in place of the budget; None for
+    none."""
     unfinished: Path | None = None
     """The file of :func:`~pointsplat_ns.compression.repair.repair`'s state; None for none."""
 
@@ -179,16 +190,22 @@ class CompactRequest:
         suffix: str = ".ply",
         target_db: float | None = None,
     ) -> CompactRequest:
-        """A request from options that may be missing: ``keep`` and ``by`` are then those of the refiner's training;
-        without a refiner, a tenth and merging. With ``photos``, a number of seconds is for the steps on
-        photos, the repair is quick, and ``keep="auto"`` is the smallest file that loses at most 0.3 dB in held-out
-        photos. Errors are those of :class:`PruneRequest`, or a BudgetError if the target is
-        not a positive number, or given with a budget or photos."""
+        """A request from options that may be missing: ``keep`` and ``by`` are then those of the
+        refiner's training; without a refiner, a tenth and merging. With ``photos``, a number of
+        seconds is for the steps on photos, the repair is quick, and ``keep="auto"`` is the smallest
+        file that loses at most 0.3 dB in held-out photos. Errors are those of
+        :class:`PruneRequest`, or a BudgetError if the target is not a positive number, or given
+        with a budget or photos."""
         if target_db is not None and not 0 < target_db < math.inf:
-            raise BudgetError(f"--target-db is {target_db:g}; expected a positive number, such as 32")
+            raise BudgetError(
+                f"--target-db is {target_db:g}; expected a positive number, such as 32"
+            )
         if target_db is not None and (photos or keep is not None):
             other = "photos, which may differ from renders" if photos else "a budget"
-            raise BudgetError(f"--target-db finds a size by renders of the dense scene; expected it without {other}")
+            raise BudgetError(
+                "--target-db finds a size by renders of the dense scene; expected it without "
+                f"{other}"
+            )
         usual = PruneSettings(0.1, "merge") if refiner is None else refiner.settings
         by = usual.by if by is None else by
         most_lost = 0.3 if photos and keep == "auto" else None
@@ -212,13 +229,14 @@ class CompactRequest:
         return self.target_db is not None or self.most_lost is not None
 
     def check_sh_degree(self, dense: Gaussians) -> None:
-        """Raise a SceneError, before the long computations, if the SH degree after pruning is certain to exceed the
-        refiner's."""
+        """Raise a SceneError, before the long computations, if the SH degree after pruning is
+        certain to exceed the refiner's."""
         if self.refiner is None:
             return
-        sh, limit = self.prune.sh, self.refiner.network.config.sh_degree
+        sh = self.prune.sh
+        limit = self.refiner.network.config.sh_degree
         if dense.sh_degree > limit and (sh == "all" or (sh.isdigit() and int(sh) > limit)):
             raise SceneError(
-                f"the scene has SH degree {dense.sh_degree}; the refiner {self.refiner.source} was built for at most "
-                f"{limit}; cut it with --sh {limit}"
+                f"the scene has SH degree {dense.sh_degree}; the refiner {self.refiner.source} was "
+                f"built for at most {limit}; cut it with --sh {limit}"
             )

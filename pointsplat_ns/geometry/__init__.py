@@ -1,1 +1,2 @@
-"""Geometry that several parts use: rotations, camera axes, nearest neighbours, space-filling curves."""
+"""Geometry that several parts use: rotations, camera axes, nearest neighbours, space-filling
+curves."""

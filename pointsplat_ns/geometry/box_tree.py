@@ -1,9 +1,10 @@
 """Nearest neighbours in plain torch, on any device: exact, in the precision of the points.
 
-The tree halves the points again and again, across the widest axis of their box, down to leaves of few points. A query
-takes the points of one leaf first, whose distances bound how far its nearest may be. Then it goes down the tree, level
-by level, into all boxes that are nearer. Many queries take each level together. Whatever the distribution, the tree has
-as many levels, and a place where all points coincide is not searched again.
+The tree halves the points again and again, across the widest axis of their box, down to leaves of
+few points. A query takes the points of one leaf first, whose distances bound how far its nearest
+may be. Then it goes down the tree, level by level, into all boxes that are nearer. Many queries
+take each level together. Whatever the distribution, the tree has as many levels, and a place where
+all points coincide is not searched again.
 """
 
 from __future__ import annotations
@@ -19,29 +20,38 @@ class BoxTree:
 
     Args:
         points: (N, 3), finite, float32 or float64, on any device; N is at least 1.
-        k: largest number of neighbours that is asked for. A leaf has at least as many points, and at least 8.
+        k: largest number of neighbours that is asked for. A leaf has at least as many points, and
+            at least 8.
     """
 
     PAIRS_AT_ONCE = 1 << 19
     """Number of pairs of a query and a box that are searched at once; 0.7 GB in a leaf."""
 
     def __init__(self, points: Tensor, k: int):
-        n, device = len(points), points.device
+        n = len(points)
+        device = points.device
         self.order = numbers(n, device)
         """Indices (N,) of the points along the tree, in which near points follow each other."""
-        self._boxes: list[tuple[Tensor, Tensor]] = []  # lowest and highest corners (2^level, 3) of each level
+        self._boxes: list[
+            tuple[Tensor, Tensor]
+        ] = []  # lowest and highest corners (2^level, 3) of each level
         while True:
             level = len(self._boxes)
             # parts of equally many points, one more or less
             self._starts = ((numbers((1 << level) + 1, device) * n) + (1 << level) - 1) >> level
-            self._points, self._width = points[self.order], (n >> level) + 1
+            self._points = points[self.order]
+            self._width = (n >> level) + 1
             inside = self._points[self._spots(numbers(1 << level, device))]
             self._boxes.append((inside.amin(1), inside.amax(1)))
             if n >> level < 2 * max(8, k):
                 break
             low, high = self._boxes[-1]
             part = (numbers(n, device) << level) // n
-            along = self._points.gather(1, (high - low).argmax(1)[part, None])[:, 0].sort(stable=True).indices
+            along = (
+                self._points.gather(1, (high - low).argmax(1)[part, None])[:, 0]
+                .sort(stable=True)
+                .indices
+            )
             self.order = self.order[along[part[along].sort(stable=True).indices]]
 
     def nearest(self, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -52,7 +62,8 @@ class BoxTree:
             k: number of neighbours, at least 1, and at most N and that of the tree.
 
         Returns:
-            Distances (m, k), and indices (m, k) int64. Of points that are equally far, any may come first.
+            Distances (m, k), and indices (m, k) int64. Of points that are equally far, any may come
+            first.
         """
         found = [self._nearest(some, k) for some in queries.split(self.PAIRS_AT_ONCE // 16)]
         squares, spots = (torch.cat(parts) for parts in zip(*found, strict=True))
@@ -69,16 +80,22 @@ class BoxTree:
         squares, slots = squares.sort(dim=1, stable=True)
         squares, spots, most = squares[:, :k], spots.gather(1, slots[:, :k]), squares[:, k - 1]
 
-        query, box = numbers(m, queries.device), torch.zeros_like(first)
+        query = numbers(m, queries.device)
+        box = torch.zeros_like(first)
         for level in range(1, len(self._boxes)):
-            query, box = query.repeat_interleave(2), torch.stack([2 * box, 2 * box + 1], dim=1).flatten()
+            query = query.repeat_interleave(2)
+            box = torch.stack([2 * box, 2 * box + 1], dim=1).flatten()
             nearer = (self._to_boxes(level, queries[query], box) < most[query]).nonzero()[:, 0]
-            query, box = query[nearer], box[nearer]
+            query = query[nearer]
+            box = box[nearer]
             if m > 1 and len(query) > self.PAIRS_AT_ONCE:
                 halves = [self._nearest(half, k) for half in queries.split(-(-m // 2))]
-                return torch.cat([half[0] for half in halves]), torch.cat([half[1] for half in halves])
+                return torch.cat([half[0] for half in halves]), torch.cat(
+                    [half[1] for half in halves]
+                )
         others = (box != first[query]).nonzero()[:, 0]
-        query, box = query[others], box[others]
+        query = query[others]
+        box = box[others]
         more, where = self._in_leaves(queries[query], box)
         row, slot = (more < most[query, None]).nonzero(as_tuple=True)
 
@@ -97,15 +114,15 @@ class BoxTree:
         return torch.maximum(low[box] - queries, queries - high[box]).clamp_min_(0).square().sum(1)
 
     def _in_leaves(self, queries: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared distances (p, w) of queries (p, 3) from the points of leaves (p,), infinite where a leaf has fewer,
-        and the places (p, w) of these points in the order of the tree."""
+        """Squared distances (p, w) of queries (p, 3) from the points of leaves (p,), infinite where
+        a leaf has fewer, and the places (p, w) of these points in the order of the tree."""
         spots = self._spots(leaf)
         squares = (queries[:, None] - self._points[spots]).square().sum(2)
         squares[:, 1:].masked_fill_(spots[:, 1:] == spots[:, :-1], torch.inf)
         return squares, spots
 
     def _spots(self, part: Tensor) -> Tensor:
-        """Places (p, w) in the order of the tree of the points in parts (p,) of the last level; the last place again
-        where there are fewer."""
+        """Places (p, w) in the order of the tree of the points in parts (p,) of the last level; the
+        last place again where there are fewer."""
         spots = self._starts[part][:, None] + numbers(self._width, part.device)
         return torch.minimum(spots, self._starts[part + 1][:, None] - 1)

@@ -1,4 +1,5 @@
-"""Places on the Earth: UTM and geographic coordinates in the Earth-centred frame of 3D Tiles (EPSG:4978, metres)."""
+"""Places on the Earth: UTM and geographic coordinates in the Earth-centred frame of 3D Tiles
+(EPSG:4978, metres)."""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ from torch import Tensor
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.system.tensors import DOUBLES
 
-_RADIUS, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84; the ellipsoid of ETRS89 is 0.1 mm smaller at the poles
+# WGS 84; the ellipsoid of ETRS89 is 0.1 mm smaller at the poles
+_RADIUS = 6378137.0
+_FLATTENING = 1 / 298.257223563
 _N = _FLATTENING / (2 - _FLATTENING)
 _MERIDIAN = _RADIUS / (1 + _N) * (1 + _N**2 / 4 + _N**4 / 64)
 _TO_SPHERE = (
@@ -32,7 +35,8 @@ _FROM_CONFORMAL = (
 
 @dataclass(frozen=True)
 class Place:
-    """Where a scene lies on the Earth: its coordinates are those of a UTM zone, or its origin is a point."""
+    """Where a scene lies on the Earth: its coordinates are those of a UTM zone, or its origin is a
+    point."""
 
     zone: int | None = None
     """1 to 60; negative south of the equator."""
@@ -41,8 +45,8 @@ class Place:
 
     @classmethod
     def parse(cls, text: str) -> Place:
-        """The place in a text: EPSG:32632 (UTM of WGS 84; 258.. of ETRS89), or LATITUDE,LONGITUDE or
-        LATITUDE,LONGITUDE,HEIGHT. Raises PointSplatError for any other."""
+        """The place in a text: EPSG:32632 (UTM of WGS 84; 258.. of ETRS89), or LATITUDE,LONGITUDE
+        or LATITUDE,LONGITUDE,HEIGHT. Raises PointSplatError for any other."""
         code = re.fullmatch(r"EPSG:(326|327|258)(\d\d)", text.strip(), re.IGNORECASE)
         if code and 1 <= int(code[2]) <= 60:
             return cls(-int(code[2]) if code[1] == "327" else int(code[2]))
@@ -54,12 +58,13 @@ class Place:
         except ValueError:
             pass
         raise PointSplatError(
-            f"the place is {text!r}; expected a UTM zone, such as EPSG:32632, or LATITUDE,LONGITUDE,HEIGHT in degrees "
-            "and metres"
+            f"the place is {text!r}; expected a UTM zone, such as EPSG:32632, or "
+            "LATITUDE,LONGITUDE,HEIGHT in degrees and metres"
         )
 
     def frame(self, point: Tensor, turn: Tensor) -> Tensor:
-        """The matrix (4, 4) float64 from a scene's axes about a point of it to the Earth-centred frame.
+        """The matrix (4, 4) float64 from a scene's axes about a point of it to the Earth-centred
+        frame.
 
         Args:
             point: (3,) float64, in the coordinates of the zone, or from the scene's origin.
@@ -71,32 +76,41 @@ class Place:
         matrix = torch.eye(4, **DOUBLES)
         if self.zone is None:
             latitude, longitude = (math.radians(degrees) for degrees in self.point[:2])
-            up, north = _upwards(latitude, longitude), _upwards(latitude + math.pi / 2, longitude)
+            up = _upwards(latitude, longitude)
+            north = _upwards(latitude + math.pi / 2, longitude)
             matrix[:3, :3] = torch.stack([torch.linalg.cross(north, up), north, up], dim=1) @ turn
-            matrix[:3, 3] = _earth_centred(latitude, longitude, self.point[2]) + matrix[:3, :3] @ point
+            matrix[:3, 3] = (
+                _earth_centred(latitude, longitude, self.point[2]) + matrix[:3, :3] @ point
+            )
             return matrix
         east, north_of_equator, height = point.tolist()
         if self.zone < 0:
             north_of_equator -= 1e7
         if not (abs(east - 5e5) < 4.5e5 and abs(north_of_equator) < 1e7):
             raise SceneError(
-                f"the scene lies at {east:.7g} {point[1]:.7g}; expected coordinates of UTM zone {abs(self.zone)}"
+                f"the scene lies at {east:.7g} {point[1]:.7g}; expected coordinates of UTM zone "
+                f"{abs(self.zone)}"
             )
         step = 100.0  # metres; curvature and rounding are below 1e-10 of it
         behind, ahead = (
-            _earth_centred(*_unprojected(east, north_of_equator + way, self.zone), height) for way in (-step, step)
+            _earth_centred(*_unprojected(east, north_of_equator + way, self.zone), height)
+            for way in (-step, step)
         )
         at = _unprojected(east, north_of_equator, self.zone)
-        up, north = _upwards(*at), (ahead - behind) / (2 * step)
+        up = _upwards(*at)
+        north = (ahead - behind) / (2 * step)
         axes = torch.stack([torch.linalg.cross(north, up), north, north.norm() * up], dim=1)
-        matrix[:3, :3], matrix[:3, 3] = axes, _earth_centred(*at, height)
+        matrix[:3, :3] = axes
+        matrix[:3, 3] = _earth_centred(*at, height)
         return matrix
 
 
 def _upwards(latitude: float, longitude: float) -> Tensor:
     """The normal (3,) of the ellipsoid; angles in radians."""
     level = math.cos(latitude)
-    return torch.tensor([level * math.cos(longitude), level * math.sin(longitude), math.sin(latitude)], **DOUBLES)
+    return torch.tensor(
+        [level * math.cos(longitude), level * math.sin(longitude), math.sin(latitude)], **DOUBLES
+    )
 
 
 def _earth_centred(latitude: float, longitude: float, height: float) -> Tensor:
@@ -108,11 +122,15 @@ def _earth_centred(latitude: float, longitude: float, height: float) -> Tensor:
 
 
 def _unprojected(east: float, north: float, zone: int) -> tuple[float, float]:
-    """Latitude and longitude, radians, of a point in a UTM zone, metres from the equator: Krueger's series, 1912, which
-    errs by less than a millimetre within 3000 km of the zone's middle."""
+    """Latitude and longitude, radians, of a point in a UTM zone, metres from the equator: Krueger's
+    series, 1912, which errs by less than a millimetre within 3000 km of the zone's middle."""
     plane = complex(north, east - 5e5) / (0.9996 * _MERIDIAN)
     sphere = plane - sum(term * cmath.sin(2 * k * plane) for k, term in enumerate(_TO_SPHERE, 1))
     conformal = math.asin(math.sin(sphere.real) / math.cosh(sphere.imag))
-    latitude = conformal + sum(term * math.sin(2 * k * conformal) for k, term in enumerate(_FROM_CONFORMAL, 1))
-    longitude = math.radians(6 * abs(zone) - 183) + math.atan2(math.sinh(sphere.imag), math.cos(sphere.real))
+    latitude = conformal + sum(
+        term * math.sin(2 * k * conformal) for k, term in enumerate(_FROM_CONFORMAL, 1)
+    )
+    longitude = math.radians(6 * abs(zone) - 183) + math.atan2(
+        math.sinh(sphere.imag), math.cos(sphere.real)
+    )
     return latitude, longitude

@@ -1,7 +1,7 @@
 """Lenses: where the pixels of a pinhole's picture lie in the photo that a lens took.
 
-Source: the camera models of COLMAP and OpenCV, "Camera Calibration and 3D Reconstruction" and "Fisheye camera model" in
-OpenCV's documentation.
+Source: the camera models of COLMAP and OpenCV, "Camera Calibration and 3D Reconstruction" and
+"Fisheye camera model" in OpenCV's documentation.
 """
 
 from __future__ import annotations
@@ -25,16 +25,25 @@ class Lens(NamedTuple):
 
 
 _MODELS = {
-    "SIMPLE_PINHOLE": False, "PINHOLE": False, "SIMPLE_RADIAL": False, "RADIAL": False, "OPENCV": False,
-    "FULL_OPENCV": False, "SIMPLE_FISHEYE": True, "FISHEYE": True, "SIMPLE_RADIAL_FISHEYE": True,
-    "RADIAL_FISHEYE": True, "OPENCV_FISHEYE": True,
-}  # fmt: skip
-"""Models of COLMAP whose parameters are the first ones of OpenCV's, and whether each is a fisheye."""
+    "SIMPLE_PINHOLE": False,
+    "PINHOLE": False,
+    "SIMPLE_RADIAL": False,
+    "RADIAL": False,
+    "OPENCV": False,
+    "FULL_OPENCV": False,
+    "SIMPLE_FISHEYE": True,
+    "FISHEYE": True,
+    "SIMPLE_RADIAL_FISHEYE": True,
+    "RADIAL_FISHEYE": True,
+    "OPENCV_FISHEYE": True,
+}
+"""Models of COLMAP whose parameters are the first ones of OpenCV's, and whether each is a
+fisheye."""
 
 
 def lens_of(model: str, distortion: tuple[float, ...]) -> Lens | None:
-    """The lens of a camera model of COLMAP and its parameters of distortion; None if it is a pinhole. Raises
-    ValueError, with the reason, if it is not known how to undo it."""
+    """The lens of a camera model of COLMAP and its parameters of distortion; None if it is a
+    pinhole. Raises ValueError, with the reason, if it is not known how to undo it."""
     if model not in _MODELS:
         raise ValueError(f"distortion of the model {model}; expected one of {', '.join(_MODELS)}")
     if not all(math.isfinite(number) for number in distortion):
@@ -46,13 +55,19 @@ def lens_of(model: str, distortion: tuple[float, ...]) -> Lens | None:
 
 
 def distorted(lens: Lens, points: Tensor) -> Tensor:
-    """Points (..., 2) of the plane at depth 1, where a pinhole sees them, moved to where the lens shows them."""
+    """Points (..., 2) of the plane at depth 1, where a pinhole sees them, moved to where the lens
+    shows them."""
     r = points.norm(dim=-1, keepdim=True)
     if lens.fisheye:
         return points * _ratio(lens, r)
     p1, p2 = lens.params[2:4]
-    twice_xy, squares = 2 * points.prod(-1, keepdim=True), r**2 + 2 * points**2
-    return points * _ratio(lens, r) + twice_xy * points.new_tensor([p1, p2]) + squares * points.new_tensor([p2, p1])
+    twice_xy = 2 * points.prod(-1, keepdim=True)
+    squares = r**2 + 2 * points**2
+    return (
+        points * _ratio(lens, r)
+        + twice_xy * points.new_tensor([p1, p2])
+        + squares * points.new_tensor([p2, p1])
+    )
 
 
 def _ratio(lens: Lens, r: Tensor) -> Tensor:
@@ -71,7 +86,8 @@ def _ratio(lens: Lens, r: Tensor) -> Tensor:
 def pixel_map(lens: Lens, K: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Where the pixels of a pinhole's picture lie in a photo of the same intrinsics and size.
 
-    A polynomial of distortion turns back beyond the pictures that it was fitted to: radii there are not taken.
+    A polynomial of distortion turns back beyond the pictures that it was fitted to: radii there are
+    not taken.
 
     Args:
         lens: of the photo.
@@ -79,10 +95,12 @@ def pixel_map(lens: Lens, K: Tensor, width: int, height: int) -> tuple[Tensor, T
         width, height: pixels.
 
     Returns:
-        (H, W, 2) float32, x and y in the photo, its sides at -1 and 1; and whether the photo shows the pixel, (H, W)
-        bool.
+        (H, W, 2) float32, x and y in the photo, its sides at -1 and 1; and whether the photo shows
+        the pixel, (H, W) bool.
     """
-    focal, centre, size = K.new_tensor([K[0, 0], K[1, 1]]), K[:2, 2], K.new_tensor([width, height])
+    focal = K.new_tensor([K[0, 0], K[1, 1]])
+    centre = K[:2, 2]
+    size = K.new_tensor([width, height])
     across, down = (torch.arange(side, **DOUBLES) + 0.5 for side in (width, height))
     points = (torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1) - centre) / focal
     radii = torch.linspace(0, float(points.norm(dim=-1).max()), 4096, **DOUBLES)

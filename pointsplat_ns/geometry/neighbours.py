@@ -1,4 +1,5 @@
-"""Nearest neighbours among points in space: exact, in float64. On a CPU, scipy's k-d tree finds them."""
+"""Nearest neighbours among points in space: exact, in float64. On a CPU, scipy's k-d tree finds
+them."""
 
 from __future__ import annotations
 
@@ -11,13 +12,15 @@ from pointsplat_ns.system.tensors import FLOATS, numbers
 from pointsplat_ns.system.threads import in_threads, most_threads
 
 QUERIES_AT_ONCE = 1 << 14
-"""Number of points whose neighbours a thread searches at once, to save memory; on a GPU, eight times as many."""
+"""Number of points whose neighbours a thread searches at once, to save memory; on a GPU, eight
+times as many."""
 
 
 def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     """The nearest points of every point, the nearest first; a point is its own nearest.
 
-    Where several points coincide, any of them may come first. Runs on the CPU, with as many threads as torch uses.
+    Where several points coincide, any of them may come first. Runs on the CPU, with as many threads
+    as torch uses.
 
     Args:
         points: (N, D), finite, any floating type and device.
@@ -45,7 +48,8 @@ def import_tree() -> None:
 
 
 class _CpuTree:
-    """What :class:`~pointsplat_ns.geometry.box_tree.BoxTree` is elsewhere, of points (N, D) float64, by scipy."""
+    """What :class:`~pointsplat_ns.geometry.box_tree.BoxTree` is elsewhere, of points (N, D)
+    float64, by scipy."""
 
     def __init__(self, points: Tensor):
         from scipy.spatial import cKDTree
@@ -54,11 +58,15 @@ class _CpuTree:
 
     @property
     def order(self) -> Tensor:
-        return torch.from_numpy(self._tree.indices.copy())  # newer releases give what must not be written to
+        return torch.from_numpy(
+            self._tree.indices.copy()
+        )  # newer releases give what must not be written to
 
     def nearest(self, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
         # The ranks are listed, because k = 1 would drop their axis.
-        distances, indices = self._tree.query(queries.numpy(), k=list(range(1, k + 1)), workers=most_threads())
+        distances, indices = self._tree.query(
+            queries.numpy(), k=list(range(1, k + 1)), workers=most_threads()
+        )
         return torch.from_numpy(distances), torch.from_numpy(indices).long()
 
 
@@ -70,8 +78,9 @@ def _tree_of(points: Tensor, k: int) -> _CpuTree | BoxTree:
 def other_neighbours(points: Tensor, k: int) -> Tensor:
     """The nearest other points of every point, without their distances, in little memory.
 
-    Where more than k points coincide, their nearest ones are the same few. So each of them has, in place of its last
-    two, those before and after it in the order of the search tree, where no two coincident points are far apart.
+    Where more than k points coincide, their nearest ones are the same few. So each of them has, in
+    place of its last two, those before and after it in the order of the search tree, where no two
+    coincident points are far apart.
 
     Args:
         points: (N, 3) float64, finite, on any device.
@@ -90,7 +99,8 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
 
     def search(these: slice) -> None:
         _, indices = tree.nearest(points[these], found)
-        # The point itself is the first, or, among coincident ones, anywhere or missing: the first takes its place.
+        # The point itself is the first, or, among coincident ones, anywhere or missing: the first
+        # takes its place.
         indices = indices.where(indices != own[these, None], indices[:, :1])
         near[these, : found - 1] = indices[:, 1:].to(torch.int32)
         same[these] = (points[near[these, k - 1].long()] == points[these]).all(1)
@@ -99,9 +109,12 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
     crowd = same.nonzero()[:, 0]
     if found > k and len(crowd):
         walk = tree.order
-        before, after = torch.empty_like(walk), torch.empty_like(walk)
-        before[walk], after[walk] = walk.roll(1), walk.roll(-1)
-        near[crowd, k - 2], near[crowd, k - 1] = before[crowd].to(torch.int32), after[crowd].to(torch.int32)
+        before = torch.empty_like(walk)
+        after = torch.empty_like(walk)
+        before[walk] = walk.roll(1)
+        after[walk] = walk.roll(-1)
+        near[crowd, k - 2] = before[crowd].to(torch.int32)
+        near[crowd, k - 1] = after[crowd].to(torch.int32)
     return near
 
 
@@ -118,6 +131,6 @@ class NearestOf:
         self._tree = _tree_of(points, self._k)
 
     def __call__(self, queries: Tensor) -> Tensor:
-        """Indices (m, min(k, N)) int64 of the points nearest to queries (m, 3) float64, finite, on their device; the
-        nearest first."""
+        """Indices (m, min(k, N)) int64 of the points nearest to queries (m, 3) float64, finite, on
+        their device; the nearest first."""
         return self._tree.nearest(queries, self._k)[1]

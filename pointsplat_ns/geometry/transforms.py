@@ -1,7 +1,7 @@
 """Rotations, poses of cameras, and positions along a space-filling curve.
 
-gsplat, COLMAP and the Replica files have cameras with OpenCV's axes (x right, y down, z forward); nerfstudio has
-OpenGL's (x right, y up, z back).
+gsplat, COLMAP and the Replica files have cameras with OpenCV's axes (x right, y down, z forward);
+nerfstudio has OpenGL's (x right, y up, z back).
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ def direction_of(axis: str) -> Tensor:
 
 
 def axis_along(direction: Tensor) -> str | None:
-    """The name of the axis along a direction (3,) of length 1, up to rounding; None if it lies along none."""
+    """The name of the axis along a direction (3,) of length 1, up to rounding; None if it lies
+    along none."""
     axis = int(direction.abs().argmax())
     if float(direction.abs()[axis]) <= 1 - 1e-6:
         return None
@@ -33,13 +34,14 @@ def axis_along(direction: Tensor) -> str | None:
 
 
 def flip_camera_axes(camera_to_worlds: Tensor) -> Tensor:
-    """Camera-to-world matrices (..., 3 or 4, 4) with OpenGL axes from OpenCV ones, or the other way round: the second
-    and third columns change their sign."""
+    """Camera-to-world matrices (..., 3 or 4, 4) with OpenGL axes from OpenCV ones, or the other way
+    round: the second and third columns change their sign."""
     return camera_to_worlds * camera_to_worlds.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
 def invert_rigid(matrices: Tensor) -> Tensor:
-    """Inverses (C, 4, 4) of rigid motions (C, 3 or 4, 4): the rotation's inverse is its transpose. Differentiable."""
+    """Inverses (C, 4, 4) of rigid motions (C, 3 or 4, 4): the rotation's inverse is its transpose.
+    Differentiable."""
     rotation = matrices[:, :3, :3].transpose(1, 2)
     translation = -rotation @ matrices[:, :3, 3:]
     last_row = matrices.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(matrices), 1, 4)
@@ -47,8 +49,8 @@ def invert_rigid(matrices: Tensor) -> Tensor:
 
 
 def viewmats_from_opengl(camera_to_worlds: Tensor) -> Tensor:
-    """World-to-camera matrices with OpenCV axes (C, 4, 4), as rasterizers take them, from nerfstudio's camera-to-world
-    (C, 3, 4), which have OpenGL axes. Differentiable."""
+    """World-to-camera matrices with OpenCV axes (C, 4, 4), as rasterizers take them, from
+    nerfstudio's camera-to-world (C, 3, 4), which have OpenGL axes. Differentiable."""
     return invert_rigid(flip_camera_axes(camera_to_worlds))
 
 
@@ -58,16 +60,17 @@ def viewmats_to_opengl(viewmats: Tensor) -> Tensor:
 
 
 SHORTEST = torch.finfo(torch.float32).tiny
-"""Smallest normal number of float32. A quaternion whose largest component is below it is taken for zero, in any
-precision: float32 has no inverse of its length, so its direction would depend on the precision."""
+"""Smallest normal number of float32. A quaternion whose largest component is below it is taken for
+zero, in any precision: float32 has no inverse of its length, so its direction would depend on the
+precision."""
 
 
 def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
     """Unit vectors (D, M) of the columns of (D, M), and the inverse of their lengths (M).
 
     A zero vector, or one shorter than :data:`SHORTEST`, becomes zero, and so does
-    its inverse length: it has no gradient. The length is taken after division by the largest component, so that neither
-    1e-30 nor 1e30 under- or overflows.
+    its inverse length: it has no gradient. The length is taken after division by the largest
+    component, so that neither 1e-30 nor 1e30 under- or overflows.
     """
     largest = vectors.abs().amax(dim=0)
     zero = largest < SHORTEST
@@ -78,12 +81,30 @@ def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rotation_components(unit: Tensor) -> Tensor:
-    """Rotation matrices (3, 3, M) of unit quaternions (4, M), each entry contiguous; zero gives the identity."""
+    """Rotation matrices (3, 3, M) of unit quaternions (4, M), each entry contiguous; zero gives the
+    identity."""
     w, x, y, z = unit
     x2, y2, z2 = 2 * unit[1:]
-    xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
-    wx, wy, wz = w * x2, w * y2, w * z2
-    rows = [1 - (yy + zz), xy - wz, xz + wy, xy + wz, 1 - (xx + zz), yz - wx, xz - wy, yz + wx, 1 - (xx + yy)]
+    xx = x * x2
+    yy = y * y2
+    zz = z * z2
+    xy = x * y2
+    xz = x * z2
+    yz = y * z2
+    wx = w * x2
+    wy = w * y2
+    wz = w * z2
+    rows = [
+        1 - (yy + zz),
+        xy - wz,
+        xz + wy,
+        xy + wz,
+        1 - (xx + zz),
+        yz - wx,
+        xz - wy,
+        yz + wx,
+        1 - (xx + yy),
+    ]
     return torch.stack(rows).view(3, 3, -1)
 
 
@@ -91,7 +112,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotation matrices of quaternions of any length.
 
     Args:
-        quats: (N, 4) wxyz, finite; zero is the identity, and so are those shorter than :data:`SHORTEST`.
+        quats: (N, 4) wxyz, finite; zero is the identity, and so are those shorter than
+            :data:`SHORTEST`.
 
     Returns:
         (N, 3, 3), of the same dtype.
@@ -108,8 +130,9 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def quaternions_of(matrices: Tensor) -> Tensor:
     """Quaternions (..., 4) wxyz, float64, of rotation matrices (..., 3, 3).
 
-    The entries of a matrix are products of the components of q. They give 4 q q^T, of which the row with the largest
-    diagonal is the best multiple of q (Shepperd 1978, Journal of Guidance and Control 1(3)).
+    The entries of a matrix are products of the components of q. They give 4 q q^T, of which the row
+    with the largest diagonal is the best multiple of q (Shepperd 1978, Journal of Guidance and
+    Control 1(3)).
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrices.double().unbind(-2))
     rows = [
@@ -119,19 +142,25 @@ def quaternions_of(matrices: Tensor) -> Tensor:
         torch.stack([d - b, c + g, f + h, 1 - a - e + i], dim=-1),
     ]
     products = torch.stack(rows, dim=-2)  # [..., 4, 4]
-    best = products.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*products.shape[:-2], 1, 4)
+    best = (
+        products.diagonal(dim1=-2, dim2=-1)
+        .argmax(-1)[..., None, None]
+        .expand(*products.shape[:-2], 1, 4)
+    )
     return torch.nn.functional.normalize(products.gather(-2, best)[..., 0, :], dim=-1)
 
 
 def zero_as_identity(quats: Tensor) -> Tensor:
-    """Quaternions (N, 4), with the identity in place of each that is zero or shorter than :data:`SHORTEST`."""
+    """Quaternions (N, 4), with the identity in place of each that is zero or shorter than
+    :data:`SHORTEST`."""
     largest = quats.detach().abs().amax(dim=1, keepdim=True)
     # In float32, because half precision would round the bound to 0.
     return torch.where(largest.float() < SHORTEST, quats.new_tensor([1.0, 0.0, 0.0, 0.0]), quats)
 
 
 def spread_bits(x: Tensor) -> Tensor:
-    """Move bit k of every integer to bit 3k, for k below 21, in five steps of half the distance each.
+    """Move bit k of every integer to bit 3k, for k below 21, in five steps of half the distance
+    each.
 
     Args:
         x: int64 of any shape; bits from 21 on are dropped.
@@ -162,31 +191,34 @@ class Cube(NamedTuple):
 
 
 def bulk_cube(means: Tensor) -> Cube:
-    """The cube around the bulk of positions (N, 3), twice as wide as 98 % of them along the widest axis: the few
-    distant Gaussians of most scenes do not coarsen the grid of the others."""
+    """The cube around the bulk of positions (N, 3), twice as wide as 98 % of them along the widest
+    axis: the few distant Gaussians of most scenes do not coarsen the grid of the others."""
     some = means[:: max(1, len(means) // 2**14)].double()
     n = len(some)
     ranked = some.sort(dim=0).values
-    low, high = ranked[(n - 1) // 100], ranked[n - 1 - (n - 1) // 100]
+    low = ranked[(n - 1) // 100]
+    high = ranked[n - 1 - (n - 1) // 100]
     side = 2 * (high - low).amax()
     return Cube(0.5 * (low + high), side.clamp_min(torch.finfo(torch.float64).tiny))
 
 
 def unit_cells(means: Tensor, cube: Cube | None = None) -> Tensor:
-    """Positions (N, 3), float32, in a cube that becomes the unit cube, by default :func:`bulk_cube`; those outside are
-    clamped to [0, 1]."""
+    """Positions (N, 3), float32, in a cube that becomes the unit cube, by default
+    :func:`bulk_cube`; those outside are clamped to [0, 1]."""
     cube = cube or bulk_cube(means)
     return (means.double() - cube.centre).div_(cube.side).float().clamp_(-0.5, 0.5).add_(0.5)
 
 
 def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
-    """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each axis."""
+    """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each
+    axis."""
     grid = (cells.T + offset).clamp_(0, 1).mul_(2**20 - 1).long()  # 60 of the 63 bits in a key
     return interleave(*(spread_bits(axis) for axis in grid))
 
 
 def smallest_turn(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (3, 3) from one direction to another; one of many if they are opposite."""
+    """The smallest rotation (3, 3) from one direction to another; one of many if they are
+    opposite."""
     cosine = float(start @ end)
     if cosine < -1 + 1e-12:
         side = torch.linalg.cross(start, torch.eye(3, **DOUBLES)[int(start.abs().argmin())])

@@ -39,10 +39,11 @@ FOLDER_FILES = FolderFiles()
 
 
 def find_scenes(folder: Path | str) -> dict[str, Path]:
-    """Every scene below a folder by its name, sorted: files that hold Gaussians, named by their path below the folder
-    without a suffix, ``deep/room``, or ``room_ply`` beside ``room_spz``; and the newest trained run of each experiment,
-    by the experiment's name. Results of earlier commands are passed over: files of the names that these give by
-    default, and whole folders. Raises SceneError if there is no such folder, it is a run, or there is no scene."""
+    """Every scene below a folder by its name, sorted: files that hold Gaussians, named by their
+    path below the folder without a suffix, ``deep/room``, or ``room_ply`` beside ``room_spz``; and
+    the newest trained run of each experiment, by the experiment's name. Results of earlier commands
+    are passed over: files of the names that these give by default, and whole folders. Raises
+    SceneError if there is no such folder, it is a run, or there is no scene."""
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
@@ -57,11 +58,16 @@ def find_scenes(folder: Path | str) -> dict[str, Path]:
     with suppress(SceneError):  # no run; those passed over have been named
         named += [(scene_name(run), run.folder) for run in find_runs(folder)]
     if not named:
-        raise SceneError(f"{folder}: no scene below it; expected files ({READABLE}) or trained Splatfacto runs")
+        raise SceneError(
+            f"{folder}: no scene below it; expected files ({READABLE}) or trained Splatfacto runs"
+        )
     counts = Counter(name for name, _ in named)
     for index, (name, path) in enumerate(named):
         if counts[name] > 1 and path.is_file():
-            named[index] = name + path.as_posix()[len(_stem(path)) :].replace(".", "_").lower(), path
+            named[index] = (
+                name + path.as_posix()[len(_stem(path)) :].replace(".", "_").lower(),
+                path,
+            )
     named.sort(key=lambda pair: (pair[0], str(pair[1])))
     return dict(zip(distinct(name for name, _ in named), (path for _, path in named), strict=True))
 
@@ -69,12 +75,13 @@ def find_scenes(folder: Path | str) -> dict[str, Path]:
 def find_runs_and_plys(
     folder: Path, supervision: Supervision
 ) -> tuple[dict[str, Run], dict[str, Path], SceneError | None]:
-    """The runs and PLY files at or below ``folder`` that a training uses, by their scene names, and the error if no run
-    was found. The data of runs is not looked for.
+    """The runs and PLY files at or below ``folder`` that a training uses, by their scene names, and
+    the error if no run was found. The data of runs is not looked for.
 
     Args:
         folder: a run, a PLY file, or any folder above several.
-        supervision: ``photos`` takes runs, ``dense`` takes both, ``auto`` takes runs, or PLY files if there is no run.
+        supervision: ``photos`` takes runs, ``dense`` takes both, ``auto`` takes runs, or PLY files
+            if there is no run.
     """
     runs: list[Run] = []
     why_no_run: SceneError | None = None
@@ -88,22 +95,32 @@ def find_runs_and_plys(
     if supervision == "dense" or (supervision == "auto" and not runs):
         plys = _files_with_gaussians(folder, lambda name: name.lower().endswith(".ply"))
     root = folder.parent if folder.is_file() else folder
-    names = distinct(file_stem("-".join(path.relative_to(root).with_suffix("").parts)) for path in plys)
-    return named, {f"{n}.ply" if n in named else n: path for n, path in zip(names, plys, strict=True)}, why_no_run
+    names = distinct(
+        file_stem("-".join(path.relative_to(root).with_suffix("").parts)) for path in plys
+    )
+    return (
+        named,
+        {f"{n}.ply" if n in named else n: path for n, path in zip(names, plys, strict=True)},
+        why_no_run,
+    )
 
 
 def find_runs(folder: Path | str) -> list[Run]:
-    """The newest run of each experiment at or below ``folder``, sorted by the experiment's name. Runs of other methods
-    and runs without a complete checkpoint are skipped. The data of runs is not looked for. Raises SceneError if there
-    is no such run, or ``folder`` is itself a run of another method."""
+    """The newest run of each experiment at or below ``folder``, sorted by the experiment's name.
+    Runs of other methods and runs without a complete checkpoint are skipped. The data of runs is
+    not looked for. Raises SceneError if there is no such run, or ``folder`` is itself a run of
+    another method."""
     folder = Path(folder)
     if not folder.exists():
-        raise SceneError(f"{folder}: no such folder; expected one with trained nerfstudio runs in it")
+        raise SceneError(
+            f"{folder}: no such folder; expected one with trained nerfstudio runs in it"
+        )
     if not folder.is_dir() or (folder / RUN_FILES.config).is_file():
         run = open_run(folder, need_data=False)
         if not run.is_gaussian_scene:
             raise SceneError(
-                f"{run.folder}: a run of the method {run.method_name or 'unknown'}; expected a trained Splatfacto run"
+                f"{run.folder}: a run of the method {run.method_name or 'unknown'}; expected a "
+                "trained Splatfacto run"
             )
         return [run]
     newest: dict[Path, Run] = {}
@@ -128,7 +145,8 @@ def find_runs(folder: Path | str) -> list[Run]:
     if not newest:
         seen = f"; passed over {len(passed)}, such as {passed[0]}" if passed else ""
         raise SceneError(
-            f"{folder}: no trained Splatfacto run below it; expected EXPERIMENT/METHOD/TIME/{RUN_FILES.config}{seen}"
+            f"{folder}: no trained Splatfacto run below it; expected "
+            f"EXPERIMENT/METHOD/TIME/{RUN_FILES.config}{seen}"
         )
     return sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
 
@@ -137,7 +155,8 @@ def distinct(names: Iterable[str]) -> list[str]:
     """The names, with ``-2``, ``-3``... appended to repeated ones."""
     unique: list[str] = []
     for base in names:
-        name, count = base, 1
+        name = base
+        count = 1
         while name in unique:
             count += 1
             name = f"{base}-{count}"
@@ -146,7 +165,8 @@ def distinct(names: Iterable[str]) -> list[str]:
 
 
 def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
-    """The scene that the viewer and the exporters get: the first one held out of training, or else the first."""
+    """The scene that the viewer and the exporters get: the first one held out of training, or else
+    the first."""
     held_out = set(eval_scenes)
     return next((name for name in names if name in held_out), names[0])
 
@@ -154,8 +174,9 @@ def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
 def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Path]:
     """Files at or below a path that hold a scene and whose names are ``wanted``, sorted.
 
-    Folders of runs, hidden folders and results of commands are not searched. A PLY may also hold points or a mesh,
-    so its header is read. Pipes, sockets and devices may have no end, and are not opened.
+    Folders of runs, hidden folders and results of commands are not searched. A PLY may also hold
+    points or a mesh, so its header is read. Pipes, sockets and devices may have no end, and are not
+    opened.
     """
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
@@ -181,15 +202,16 @@ def _stem(path: Path) -> str:
 
 
 def _experiment_folder(run: Run) -> Path:
-    """The folder that all runs of an experiment share: EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP. For a run that was
-    moved out of that layout, its own folder."""
+    """The folder that all runs of an experiment share: EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP.
+    For a run that was moved out of that layout, its own folder."""
     place = run.folder.resolve()
     as_laid_out = (place.parent.name, place.name) == (run.method_name, run.timestamp)
     return place.parents[1] if as_laid_out else place
 
 
 def _when(run: Run) -> tuple[float, int]:
-    """Sort key of a run's age: nerfstudio's timestamp, or the checkpoint's file time if the timestamp was renamed."""
+    """Sort key of a run's age: nerfstudio's timestamp, or the checkpoint's file time if the
+    timestamp was renamed."""
     try:
         return datetime.strptime(run.timestamp, "%Y-%m-%d_%H%M%S").timestamp(), run.step
     except ValueError:
@@ -197,7 +219,8 @@ def _when(run: Run) -> tuple[float, int]:
 
 
 def _why_none(path: Path) -> str:
-    """Why a file holds no Gaussians: it is a PLY of points or of a mesh. Empty if it does, or if its reader says it."""
+    """Why a file holds no Gaussians: it is a PLY of points or of a mesh. Empty if it does, or if
+    its reader says it."""
     if not path.is_file():
         return "not a regular file"
     try:

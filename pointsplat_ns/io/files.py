@@ -1,4 +1,5 @@
-"""Helpers of all readers and writers: checks of files and of places for files, hashes, atomic writes."""
+"""Helpers of all readers and writers: checks of files and of places for files, hashes, atomic
+writes."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 def require_file(path: Path | str, what: str) -> Path:
-    """``path`` as a Path. Raises SceneError if it is no regular file, which says that ``what`` was expected."""
+    """``path`` as a Path. Raises SceneError if it is no regular file, which says that ``what`` was
+    expected."""
     path = Path(path)
     if not path.exists():
         raise SceneError(f"{path}: no such file; expected {what}")
@@ -60,23 +62,27 @@ def failure_named(path: Path, what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SceneError(f"{path}: cannot be {what} ({error.strerror or one_line(error)})") from error
+        raise SceneError(
+            f"{path}: cannot be {what} ({error.strerror or one_line(error)})"
+        ) from error
 
 
 def require_memory(path: Path | str, size: int) -> None:
-    """Raise a SceneError if ``size`` bytes, which a file's content takes, are not free. A sparse file, whose zeros take
-    no disk space, may claim any size."""
+    """Raise a SceneError if ``size`` bytes, which a file's content takes, are not free. A sparse
+    file, whose zeros take no disk space, may claim any size."""
     import psutil
 
     free = psutil.virtual_memory().available
     if size > free:
         raise SceneError(
-            f"{path}: takes {size / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free; expected a file that fits"
+            f"{path}: takes {size / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free; expected "
+            "a file that fits"
         )
 
 
 def content_hash(path: Path | str) -> str:
-    """SHA-256 of a file's bytes, as 64 hexadecimal digits. The file is read in pieces: it need not fit into memory.
+    """SHA-256 of a file's bytes, as 64 hexadecimal digits. The file is read in pieces: it need not
+    fit into memory.
 
     Raises:
         SceneError: if there is no such file, or it cannot be read.
@@ -90,32 +96,36 @@ def content_hash(path: Path | str) -> str:
 
 
 def one_line(error: BaseException, limit: int = 160) -> str:
-    """The first line of an exception's text, at most ``limit`` characters; the name of its type if it has no text."""
+    """The first line of an exception's text, at most ``limit`` characters; the name of its type if
+    it has no text."""
     lines = str(error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 def file_stem(text: str) -> str:
-    """``text`` as a file name: other characters than letters, digits and ``_ . + -`` become ``-``; "scene" if nothing
-    is left."""
+    """``text`` as a file name: other characters than letters, digits and ``_ . + -`` become ``-``;
+    "scene" if nothing is left."""
     return re.sub(r"[^\w.+-]+", "-", text).strip("-.") or "scene"
 
 
 @contextmanager
-def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named: bool = True) -> Iterator[Path]:
-    """A temporary path beside ``path`` to write to. It replaces ``path`` when the block ends without an error, else it
-    is removed.
+def replacing(
+    path: Path | str, size: int = 0, folder: Path | None = None, named: bool = True
+) -> Iterator[Path]:
+    """A temporary path beside ``path`` to write to. It replaces ``path`` when the block ends
+    without an error, else it is removed.
 
-    Missing parent folders are created. Through a symbolic link, its target is written. A file that is replaced keeps
-    its mode. Of several writers of one path, each has a temporary path of its own, and the last one's file stays.
+    Missing parent folders are created. Through a symbolic link, its target is written. A file that
+    is replaced keeps its mode. Of several writers of one path, each has a temporary path of its
+    own, and the last one's file stays.
 
     Args:
         path: the file.
         size: bytes that will be written, if that is known; they must be free.
         folder: where the temporary path is instead, on the same file system.
-        named: whether a person named the file. If not, a symbolic link there is replaced itself: somebody else made it,
-            as in a folder that came from elsewhere.
+        named: whether a person named the file. If not, a symbolic link there is replaced itself:
+            somebody else made it, as in a folder that came from elsewhere.
 
     Raises:
         SceneError: if ``path`` is a folder or a device, or cannot be written.
@@ -158,8 +168,8 @@ def need_new(path: Path, force: bool) -> None:
 
 
 def need_writable(path: Path, force: bool) -> None:
-    """Raise a SceneError if a file cannot be written: it is a folder, a pipe or a device, its folder takes none, or it
-    exists and ``force`` does not allow to replace it."""
+    """Raise a SceneError if a file cannot be written: it is a folder, a pipe or a device, its
+    folder takes none, or it exists and ``force`` does not allow to replace it."""
     with failure_named(path, "written"):
         need_new(path, force)
         _need_place(path, _target_of(path).absolute().parent)
@@ -185,13 +195,20 @@ def _target_of(path: Path) -> Path:
     """The file that is written for ``path``: the target of a symbolic link, else ``path`` itself.
 
     Raises:
-        SceneError: if it is a folder, a device or a pipe, a link to what is not there, or no name of a file.
+        SceneError: if it is a folder, a device or a pipe, a link to what is not there, or no name
+            of a file.
     """
     if "\0" in str(path):
-        raise SceneError(f"{str(path)!r}: holds a NUL character; expected the name of a file to write")
+        raise SceneError(
+            f"{str(path)!r}: holds a NUL character; expected the name of a file to write"
+        )
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
-    if target != path and not os.path.lexists(target):  # whoever made the link may want a file to appear there
-        raise SceneError(f"{path}: a link to {target}, where nothing is; remove it, or name that file")
+    if target != path and not os.path.lexists(
+        target
+    ):  # whoever made the link may want a file to appear there
+        raise SceneError(
+            f"{path}: a link to {target}, where nothing is; remove it, or name that file"
+        )
     if target.is_dir():
         raise SceneError(f"{path}: is a folder; expected the name of a file to write")
     _mode_of(target)
@@ -199,12 +216,13 @@ def _target_of(path: Path) -> Path:
 
 
 def require_space(path: Path, folder: Path, size: int) -> None:
-    """Raise a SceneError if the disk has less than ``size`` bytes. A file that is replaced stays until the end."""
+    """Raise a SceneError if the disk has less than ``size`` bytes. A file that is replaced stays
+    until the end."""
     disk = shutil.disk_usage(folder)
     if disk.total and size > disk.free:  # some network file systems tell nothing
         raise SceneError(
-            f"{path}: needs {bytes_text(size)}, {bytes_text(disk.free)} are free there, so nothing was written; make "
-            "room or name another place"
+            f"{path}: needs {bytes_text(size)}, {bytes_text(disk.free)} are free there, so nothing "
+            "was written; make room or name another place"
         )
 
 
@@ -215,7 +233,9 @@ def bytes_text(size: float) -> str:
         >>> bytes_text(3_847), bytes_text(113_400_000), bytes_text(2.5e9)
         ('3.85 kB', '113 MB', '2.50 GB')
     """
-    factor, unit = next((pair for pair in ((1e9, "GB"), (1e6, "MB")) if size >= pair[0]), (1e3, "kB"))
+    factor, unit = next(
+        (pair for pair in ((1e9, "GB"), (1e6, "MB")) if size >= pair[0]), (1e3, "kB")
+    )
     return f"{three_digits(size / factor)} {unit}"
 
 
@@ -231,8 +251,8 @@ def three_digits(value: float) -> str:
 
 
 def _mode_of(path: Path) -> int | None:
-    """Permission bits of a file that is to be replaced; None if there is none. Raises SceneError if it is not
-    regular."""
+    """Permission bits of a file that is to be replaced; None if there is none. Raises SceneError if
+    it is not regular."""
     try:
         status = path.lstat()
     except FileNotFoundError:
@@ -243,7 +263,8 @@ def _mode_of(path: Path) -> int | None:
 
 
 def json_text(content: Any) -> str:
-    """JSON of numbers, text, paths and collections of them, with null for numbers that JSON does not have.
+    """JSON of numbers, text, paths and collections of them, with null for numbers that JSON does
+    not have.
 
     Example:
         >>> print(json_text({"psnr": float("inf"), "output": Path("room.ply")}))
@@ -270,22 +291,33 @@ def _without_infinities(value: Any) -> Any:
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write rows of the same columns to a CSV file, as :func:`replacing` writes what no person named.
+    """Write rows of the same columns to a CSV file, as :func:`replacing` writes what no person
+    named.
 
-    A text that spreadsheets would take for a formula, which may send what stands in other cells (OWASP, CSV injection),
-    gets a leading apostrophe: a file's name may be a stranger's.
+    A text that spreadsheets would take for a formula, which may send what stands in other cells
+    (OWASP, CSV injection), gets a leading apostrophe: a file's name may be a stranger's.
     """
     formula = tuple("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
-    with replacing(path, named=False) as part, part.open("w", encoding="utf-8", newline="") as stream:
+    with (
+        replacing(path, named=False) as part,
+        part.open("w", encoding="utf-8", newline="") as stream,
+    ):
         writer = csv.DictWriter(stream, list(rows[0]))
         writer.writeheader()
         for row in rows:
-            texts = {name for name, value in row.items() if isinstance(value, str) and value.startswith(formula)}
-            writer.writerow({name: f"'{value}" if name in texts else value for name, value in row.items()})
+            texts = {
+                name
+                for name, value in row.items()
+                if isinstance(value, str) and value.startswith(formula)
+            }
+            writer.writerow(
+                {name: f"'{value}" if name in texts else value for name, value in row.items()}
+            )
 
 
 def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:
-    """Write tensors of any device and a header of metadata to a safetensors file, as :func:`replacing` does."""
+    """Write tensors of any device and a header of metadata to a safetensors file, as
+    :func:`replacing` does."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 

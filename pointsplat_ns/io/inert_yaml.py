@@ -1,8 +1,8 @@
 """Reads nerfstudio's ``config.yml`` without executing it.
 
-nerfstudio saves its configuration as YAML with Python objects. The usual loader imports and calls whatever the file
-names. Here a tag such as ``!!python/object:pkg.Class`` becomes a :class:`Tagged` value, paths become
-:class:`pathlib.Path` and tuples become tuples. Nothing is imported or called.
+nerfstudio saves its configuration as YAML with Python objects. The usual loader imports and calls
+whatever the file names. Here a tag such as ``!!python/object:pkg.Class`` becomes a :class:`Tagged`
+value, paths become :class:`pathlib.Path` and tuples become tuples. Nothing is imported or called.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ class _Loader(yaml.SafeLoader):
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Refuse merge keys: nested ones grow exponentially, and nerfstudio writes none."""
         if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
-            raise yaml.constructor.ConstructorError(None, None, "merge keys are not supported", node.start_mark)
+            raise yaml.constructor.ConstructorError(
+                None, None, "merge keys are not supported", node.start_mark
+            )
 
 
 def read_config(path: Path | str) -> Tagged:
@@ -53,9 +55,13 @@ def read_config(path: Path | str) -> Tagged:
         SceneError: if it is not YAML, too big, too deep, or has no Python object at its root.
     """
     path = require_file(path, "nerfstudio's config.yml")
-    size, most = path.stat().st_size, 1 << 18  # one has about 10 kB
+    # one has about 10 kB
+    size = path.stat().st_size
+    most = 1 << 18
     if size > most:
-        raise SceneError(f"{path}: {size} bytes; expected a nerfstudio config.yml of at most {most}")
+        raise SceneError(
+            f"{path}: {size} bytes; expected a nerfstudio config.yml of at most {most}"
+        )
     try:
         loader = _Loader(path.read_text("utf-8"))
         try:
@@ -67,18 +73,22 @@ def read_config(path: Path | str) -> Tagged:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
         line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise SceneError(f"{path}: not a nerfstudio config.yml ({error.problem or 'not YAML'}{line})") from error
+        raise SceneError(
+            f"{path}: not a nerfstudio config.yml ({error.problem or 'not YAML'}{line})"
+        ) from error
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError, OSError) as error:
         raise SceneError(f"{path}: not a nerfstudio config.yml ({one_line(error, 100)})") from error
     if not isinstance(root, Tagged) or not root.fields:
-        raise SceneError(f"{path}: not a nerfstudio config.yml; expected a saved trainer configuration")
+        raise SceneError(
+            f"{path}: not a nerfstudio config.yml; expected a saved trainer configuration"
+        )
     return root
 
 
 def _count(node: yaml.Node, known: dict[int, int], most: int = 1 << 16) -> int:
-    """The number of values that a node stands for, those that aliases repeat counted each time; a ValueError if there
-    are more than ``most``, or the node holds itself. nerfstudio's file has some hundreds. As text or as a key, a value
-    is as long as all that it holds.
+    """The number of values that a node stands for, those that aliases repeat counted each time; a
+    ValueError if there are more than ``most``, or the node holds itself. nerfstudio's file has some
+    hundreds. As text or as a key, a value is as long as all that it holds.
 
     ``known`` has the numbers by the identity of nodes; 0 marks those that are being counted.
     """
@@ -121,4 +131,6 @@ def _plain(loader: _Loader, node: yaml.Node) -> Any:
 
 
 _Loader.add_multi_constructor("tag:yaml.org,2002:python/", _python)
-_Loader.add_multi_constructor("!", lambda loader, suffix, node: Tagged(f"!{suffix}", _plain(loader, node)))
+_Loader.add_multi_constructor(
+    "!", lambda loader, suffix, node: Tagged(f"!{suffix}", _plain(loader, node))
+)

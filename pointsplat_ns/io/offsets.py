@@ -1,4 +1,5 @@
-"""Scenes far from their origin, such as geo-referenced ones: the offset that leaves float32 its digits."""
+"""Scenes far from their origin, such as geo-referenced ones: the offset that leaves float32 its
+digits."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ def offset_for(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> 
 
 
 def rounded_centre(means: NDArray[np.float64]) -> Offset:
-    """The median position (3,) of finite positions (N, 3), N > 0, rounded to a power of ten within their extent."""
+    """The median position (3,) of finite positions (N, 3), N > 0, rounded to a power of ten within
+    their extent."""
     centre = np.median(means, axis=0)
     extent = float(np.median(np.abs(means - centre).max(axis=1)))
     unit = 10.0 ** math.floor(math.log10(extent)) if extent > 1e-300 else 0.0
@@ -42,7 +44,8 @@ def rounded_centre(means: NDArray[np.float64]) -> Offset:
 
 
 def warn_if_far(scene: Gaussians, path: Path | str) -> None:
-    """Log that a scene's positions have lost digits, if steps of float32 are large beside the sizes of Gaussians."""
+    """Log that a scene's positions have lost digits, if steps of float32 are large beside the sizes
+    of Gaussians."""
     some = scene[:: max(1, len(scene) // SAMPLED)]
     if not len(some):
         return
@@ -50,10 +53,13 @@ def warn_if_far(scene: Gaussians, path: Path | str) -> None:
     times = _steps_a_size(means, some.scales.detach().double().cpu().numpy())
     if times > 1 / 4:
         logger.warning(
-            "%s: lies %.3g units from its origin, where float32 has steps of %.2g times the median size of a Gaussian: "
-            "positions have lost their digits; export it with x, y and z as doubles, or nearer to the origin",
-            path, np.abs(np.median(means, axis=0)).max(), times,
-        )  # fmt: skip
+            "%s: lies %.3g units from its origin, where float32 has steps of %.2g times the "
+            "median size of a Gaussian: positions have lost their digits; export it with x, y and "
+            "z as doubles, or nearer to the origin",
+            path,
+            np.abs(np.median(means, axis=0)).max(),
+            times,
+        )
 
 
 def offset_text(offset: Offset) -> str:
@@ -72,7 +78,8 @@ def offset_of_text(text: str) -> Offset | None:
 
 
 def from_centre(scene: Gaussians) -> Gaussians:
-    """A scene about its middle: with the offset of :func:`rounded_centre`, in the frame of its file."""
+    """A scene about its middle: with the offset of :func:`rounded_centre`, in the frame of its
+    file."""
     usable = scene.means[scene.usable()].double().cpu()
     if not len(usable):
         return scene

@@ -1,4 +1,5 @@
-"""Photos in a folder: which belong to the cameras of a file, and their pixels as pinholes see them."""
+"""Photos in a folder: which belong to the cameras of a file, and their pixels as pinholes see
+them."""
 
 from __future__ import annotations
 
@@ -28,8 +29,9 @@ MOST_PIXELS = 150_000_000
 
 
 def photo_files(folder: Path) -> list[str]:
-    """Paths of the photos in a folder or below, relative to it with ``/`` between folders, sorted; hidden ones are not
-    among them. Raises DataError if there are none, or too many, or there is no such folder."""
+    """Paths of the photos in a folder or below, relative to it with ``/`` between folders, sorted;
+    hidden ones are not among them. Raises DataError if there are none, or too many, or there is no
+    such folder."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; expected the folder of the photos")
     found: list[str] = []
@@ -37,9 +39,13 @@ def photo_files(folder: Path) -> list[str]:
         inner[:] = [name for name in inner if not name.startswith(".")]
         relative = Path(place).relative_to(folder)
         shown = (name for name in files if not name.startswith("."))
-        found += [(relative / name).as_posix() for name in shown if name.lower().endswith(PHOTO_SUFFIXES)]
+        found += [
+            (relative / name).as_posix() for name in shown if name.lower().endswith(PHOTO_SUFFIXES)
+        ]
         if len(found) > 100_000:
-            raise DataError(f"{folder}: more than 100,000 photos; expected the folder of one capture's photos")
+            raise DataError(
+                f"{folder}: more than 100,000 photos; expected the folder of one capture's photos"
+            )
     if not found:
         raise DataError(f"{folder}: no photo in it; expected files {', '.join(PHOTO_SUFFIXES)}")
     return sorted(found)
@@ -48,11 +54,13 @@ def photo_files(folder: Path) -> list[str]:
 def photos_of_cameras(folder: Path, files: Sequence[str], named: NamedViews) -> dict[int, Path]:
     """The photo of each view that has one, by the index of the view.
 
-    A photo lies in the folder under the name that the model has; else where the model's own folder has it; else it is
-    the only one whose path ends like the name, suffixes apart. A photo that two views would have is nobody's.
+    A photo lies in the folder under the name that the model has; else where the model's own folder
+    has it; else it is the only one whose path ends like the name, suffixes apart. A photo that two
+    views would have is nobody's.
     """
     root = folder.absolute()
-    known, by_end = set(files), defaultdict(list)
+    known = set(files)
+    by_end = defaultdict(list)
     for file in files:
         parts = _parts(file)
         for first in range(len(parts)):
@@ -92,40 +100,55 @@ class Photo:
 
 
 class PhotoReader:
-    """Reads photos of cameras: reduced while decoding, undistorted, and with the mask that the file of cameras names.
+    """Reads photos of cameras: reduced while decoding, undistorted, and with the mask that the file
+    of cameras names.
 
-    The pinhole has the focal lengths and the principal point of the camera. Pixels that the lens does not show do not
-    count. What is computed for a lens is kept: a capture has few.
+    The pinhole has the focal lengths and the principal point of the camera. Pixels that the lens
+    does not show do not count. What is computed for a lens is kept: a capture has few.
 
     Args:
         masks: the folder in which, or below which, the masks lie that cameras name.
         side: longer side of the pictures, pixels; smaller photos stay as they are.
-        folder: of the photos. Where cameras name no mask, that of ``a.jpg`` is ``a.jpg.png``, as COLMAP names it, or
-            ``a.png`` in the folder ``masks`` beside it.
+        folder: of the photos. Where cameras name no mask, that of ``a.jpg`` is ``a.jpg.png``, as
+            COLMAP names it, or ``a.png`` in the folder ``masks`` beside it.
     """
 
     def __init__(self, masks: Path, side: int, folder: Path | None = None):
-        self._masks, self._side, self._folder = masks, side, folder
+        self._masks = masks
+        self._side = side
+        self._folder = folder
         self._maps: dict[tuple, tuple[Tensor, Tensor]] = {}
 
     def size(self, path: Path, camera: Camera) -> tuple[int, int]:
-        """Width and height, pixels, that a photo will have. Its pixels are not decoded. Errors are those of
-        :meth:`read`."""
+        """Width and height, pixels, that a photo will have. Its pixels are not decoded. Errors are
+        those of :meth:`read`."""
         return self._opened(path, camera)[0]
 
     def read(self, path: Path, camera: Camera) -> Photo:
-        """The photo of a camera. Raises DataError if it cannot be read, is huge or of another shape than the camera,
-        or its lens cannot be undone."""
+        """The photo of a camera. Raises DataError if it cannot be read, is huge or of another shape
+        than the camera, or its lens cannot be undone."""
         from PIL import Image, ImageOps
 
         size, turned = self._opened(path, camera)
         try:
             with Image.open(path) as opened:
-                opened.draft("RGB", size[::-1] if turned else size)  # JPEGs are decoded at a half or less
-                kind = "RGBA" if opened.mode in ("RGBA", "LA", "PA") or "transparency" in opened.info else "RGB"
+                opened.draft(
+                    "RGB", size[::-1] if turned else size
+                )  # JPEGs are decoded at a half or less
+                kind = (
+                    "RGBA"
+                    if opened.mode in ("RGBA", "LA", "PA") or "transparency" in opened.info
+                    else "RGB"
+                )
                 upright = ImageOps.exif_transpose(opened) if turned else opened
                 picture = np.array(upright.convert(kind).resize(size, Image.Resampling.BOX))
-        except (OSError, ValueError, SyntaxError, MemoryError, Image.DecompressionBombError) as error:
+        except (
+            OSError,
+            ValueError,
+            SyntaxError,
+            MemoryError,
+            Image.DecompressionBombError,
+        ) as error:
             raise DataError(f"{path}: cannot be read as a photo ({one_line(error, 80)})") from error
         image = torch.from_numpy(picture)
         if image.shape[2] == 4:
@@ -134,13 +157,14 @@ class PhotoReader:
         K = torch.eye(3, **DOUBLES)
         for axis in range(2):
             stretch = size[axis] / camera.size[axis]
-            K[axis, axis], K[axis, 2] = camera.focal[axis] * stretch, camera.centre[axis] * stretch
+            K[axis, axis] = camera.focal[axis] * stretch
+            K[axis, 2] = camera.centre[axis] * stretch
         try:
             lens = lens_of(camera.model, camera.distortion)
         except ValueError as error:
             raise DataError(
-                f"{path}: its camera has {error}; undistort the photos (colmap image_undistorter) and take the model "
-                "that this writes"
+                f"{path}: its camera has {error}; undistort the photos (colmap image_undistorter) "
+                "and take the model that this writes"
             ) from error
         if lens is None:
             return Photo(image, mask, K)
@@ -150,38 +174,50 @@ class PhotoReader:
         return Photo(image, shown, K)
 
     def _opened(self, path: Path, camera: Camera) -> tuple[tuple[int, int], bool]:
-        """The size that a photo will have, and whether its EXIF orientation is followed, which is so where the camera
-        is that of the turned photo."""
+        """The size that a photo will have, and whether its EXIF orientation is followed, which is
+        so where the camera is that of the turned photo."""
         from PIL import Image
 
         try:
             with Image.open(path) as opened:
-                size, mode = opened.size, opened.mode
+                size = opened.size
+                mode = opened.mode
                 hint = exif_hint(path, (int(camera.size[0]), int(camera.size[1])))
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise DataError(f"{path}: cannot be read as a photo ({one_line(error, 80)})") from error
         if size[0] * size[1] > MOST_PIXELS:
-            raise DataError(f"{path}: {size[0]} x {size[1]} pixels; expected at most {MOST_PIXELS / 1e6:.0f} million")
+            raise DataError(
+                f"{path}: {size[0]} x {size[1]} pixels; expected at most {MOST_PIXELS / 1e6:.0f} "
+                "million"
+            )
         if mode.startswith(("I", "F")):
-            raise DataError(f"{path}: its pixels are of mode {mode}; expected 8 bits a channel; convert it")
+            raise DataError(
+                f"{path}: its pixels are of mode {mode}; expected 8 bits a channel; convert it"
+            )
         turned = bool(hint)
         width, height = size[::-1] if turned else size
         if abs(width * camera.size[1] / (height * camera.size[0]) - 1) > 0.02:
             raise DataError(
-                f"{path}: {width} x {height} pixels, but its camera says {camera.size[0]:.0f} x {camera.size[1]:.0f}; "
-                "expected that shape: the photos that the poses were computed from, or smaller copies"
+                f"{path}: {width} x {height} pixels, but its camera says {camera.size[0]:.0f} x "
+                f"{camera.size[1]:.0f}; expected that shape: the photos that the poses were "
+                "computed from, or smaller copies"
             )
         factor = min(1.0, self._side / max(width, height))
         return (max(1, round(width * factor)), max(1, round(height * factor))), turned
 
     def mask_of(self, path: Path, camera: Camera) -> Path | None:
-        """The file of the mask of a photo; None if all its pixels count. Raises DataError if the mask that its camera
-        names is not there."""
+        """The file of the mask of a photo; None if all its pixels count. Raises DataError if the
+        mask that its camera names is not there."""
         relative = PurePosixPath(camera.mask if "\0" not in camera.mask else "")
         if relative.name:
             mask = self._masks / relative
-            if relative.is_absolute() or ".." in relative.parts or not mask.is_file():  # nothing outside is opened
-                raise DataError(f"{mask}: no such mask, but the cameras name it; put it there, or take its name away")
+            if (
+                relative.is_absolute() or ".." in relative.parts or not mask.is_file()
+            ):  # nothing outside is opened
+                raise DataError(
+                    f"{mask}: no such mask, but the cameras name it; put it there, or take its "
+                    "name away"
+                )
             return mask
         if self._folder is None:
             return None
@@ -201,17 +237,26 @@ class PhotoReader:
                 if opened.width * opened.height > MOST_PIXELS:
                     raise ValueError(f"more than {MOST_PIXELS / 1e6:.0f} million pixels")
                 small = opened.convert("L").resize(size, Image.Resampling.BOX)
-        except (OSError, ValueError, SyntaxError, MemoryError, Image.DecompressionBombError) as error:
+        except (
+            OSError,
+            ValueError,
+            SyntaxError,
+            MemoryError,
+            Image.DecompressionBombError,
+        ) as error:
             raise DataError(f"{path}: cannot be read as a mask ({one_line(error, 80)})") from error
         return torch.from_numpy(np.array(small)).ge(128)[..., None]
 
-    def _map(self, path: Path, lens: Lens, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    def _map(
+        self, path: Path, lens: Lens, K: Tensor, size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
         key = (lens, *K.flatten().tolist(), size)
         if key not in self._maps:
             places, shown = pixel_map(lens, K, *size)
             if float(shown.double().mean()) < 0.1:
                 raise DataError(
-                    f"{path}: the lens distortion of its camera leaves nothing of the photo; check its coefficients"
+                    f"{path}: the lens distortion of its camera leaves nothing of the photo; "
+                    "check its coefficients"
                 )
             if len(self._maps) >= 8:  # of a lens for each photo none is needed twice
                 self._maps.pop(next(iter(self._maps)))
@@ -222,4 +267,6 @@ class PhotoReader:
 def _sampled(image: Tensor, places: Tensor) -> Tensor:
     """An image (H, W, C) at places (h, w, 2), bilinear: (h, w, C) float32."""
     planes = image.permute(2, 0, 1)[None].float()
-    return F.grid_sample(planes, places[None], padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
+    return F.grid_sample(planes, places[None], padding_mode="border", align_corners=False)[
+        0
+    ].permute(1, 2, 0)

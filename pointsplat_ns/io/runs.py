@@ -67,8 +67,8 @@ class Run:
     """As configured; empty or "unnamed" where the user gave none."""
     timestamp: str
     data: Path
-    """Training data of the run: a path that exists if :func:`open_run` was called with ``need_data``, else the
-    configured path."""
+    """Training data of the run: a path that exists if :func:`open_run` was called with
+    ``need_data``, else the configured path."""
     dataparser_class: str
     """Dotted name of the dataparser's configuration class."""
     dataparser_fields: dict[str, Any]
@@ -81,11 +81,14 @@ class Run:
     @property
     def is_refiner(self) -> bool:
         """Whether the checkpoint holds a refiner for many scenes."""
-        return self.method_name == METHOD_NAMES.refiner or self.method_name.startswith(f"{METHOD_NAMES.refiner}-")
+        return self.method_name == METHOD_NAMES.refiner or self.method_name.startswith(
+            f"{METHOD_NAMES.refiner}-"
+        )
 
     @property
     def is_gaussian_scene(self) -> bool:
-        """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from it."""
+        """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from
+        it."""
         if self.is_refiner:
             return False
         # Methods derived from Splatfacto have these settings, too.
@@ -95,11 +98,14 @@ class Run:
     @property
     def rasterize_mode(self) -> Literal["classic", "antialiased"]:
         """Rasterize mode that the run was trained with."""
-        return "antialiased" if self.model_fields.get("rasterize_mode") == "antialiased" else "classic"
+        return (
+            "antialiased" if self.model_fields.get("rasterize_mode") == "antialiased" else "classic"
+        )
 
 
 def may_be_run(path: Path | str) -> bool:
-    """Whether a path is one that runs have: a folder, a checkpoint or YAML. Other files hold nothing but a scene."""
+    """Whether a path is one that runs have: a folder, a checkpoint or YAML. Other files hold
+    nothing but a scene."""
     path = Path(path)
     return path.is_dir() or path.suffix.lower() in (".ckpt", ".yml", ".yaml")
 
@@ -108,27 +114,35 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
     """The run at ``path``.
 
     Args:
-        path: the run's folder, its ``config.yml``, or one of its checkpoints (which is then the one used).
-        need_data: look for the data the run was trained on. A relative path is tried from the current
-            folder, then from the run's folder and every folder above it.
-        data: where the data is now, if the run moved: the data itself, or a folder above it in which the last names of
-            the configured path are looked for.
+        path: the run's folder, its ``config.yml``, or one of its checkpoints (which is then the one
+            used).
+        need_data: look for the data the run was trained on. A relative path is tried from the
+            current folder, then from the run's folder and every folder above it.
+        data: where the data is now, if the run moved: the data itself, or a folder above it in
+            which the last names of the configured path are looked for.
 
     Raises:
-        SceneError: if ``path`` is not a run, has no complete checkpoint, or its data is needed and not found.
+        SceneError: if ``path`` is not a run, has no complete checkpoint, or its data is needed and
+            not found.
     """
     path = Path(path)
     if not path.exists():
         raise SceneError(f"{path}: no such file or folder; expected a nerfstudio run")
     if not may_be_run(path):
-        raise SceneError(f"{path}: not a nerfstudio run; expected its folder, its {RUN_FILES.config} or a checkpoint")
+        raise SceneError(
+            f"{path}: not a nerfstudio run; expected its folder, its {RUN_FILES.config} or a "
+            "checkpoint"
+        )
     chosen = path if path.suffix == ".ckpt" else None
     folder = path if path.is_dir() else path.parent
     if chosen is not None and not (folder / RUN_FILES.config).is_file():
         folder = folder.parent
     config_path = path if path.is_file() and chosen is None else folder / RUN_FILES.config
     if not config_path.is_file():
-        raise SceneError(f"{path}: not a nerfstudio run; expected a folder with {RUN_FILES.config} (no {config_path})")
+        raise SceneError(
+            f"{path}: not a nerfstudio run; expected a folder with {RUN_FILES.config} (no "
+            f"{config_path})"
+        )
     root = read_config(config_path)
     pipeline = _tagged(root, "pipeline", config_path)
     datamanager = _tagged(pipeline, "datamanager", config_path)
@@ -137,8 +151,19 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
     dataparser = datamanager.fields.get("dataparser")
     dataparser = dataparser if isinstance(dataparser, Tagged) else Tagged("", {})
     checkpoint, step = _checkpoint(folder, root.fields.get("relative_model_dir"), chosen)
-    candidates = (datamanager.fields.get("data"), dataparser.fields.get("data"), root.fields.get("data"))
-    named = next((Path(value) for value in candidates if isinstance(value, (str, Path)) and str(value) != "."), Path())
+    candidates = (
+        datamanager.fields.get("data"),
+        dataparser.fields.get("data"),
+        root.fields.get("data"),
+    )
+    named = next(
+        (
+            Path(value)
+            for value in candidates
+            if isinstance(value, (str, Path)) and str(value) != "."
+        ),
+        Path(),
+    )
     found = _found_data(named, folder, config_path, data) if need_data else named
     transform, scale = read_transforms(folder / RUN_FILES.transforms)
     return Run(
@@ -160,7 +185,8 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
 
 
 def scene_name(run: Run) -> str:
-    """A short name for the scene that can be a file name: the experiment's, or the data folder's if it has none."""
+    """A short name for the scene that can be a file name: the experiment's, or the data folder's if
+    it has none."""
     name = run.experiment_name if run.experiment_name != "unnamed" else ""
     data = run.data.parent if run.data.suffix else run.data
     return file_stem(name or data.name or run.folder.name)
@@ -181,8 +207,13 @@ def _tagged(parent: Tagged, name: str, path: Path) -> Tagged:
 
 
 def _settings(config: Tagged, *without: str) -> dict[str, Any]:
-    """Fields of a configuration object, except those that begin with ``_`` and those in ``without``."""
-    return {key: value for key, value in config.fields.items() if not str(key).startswith("_") and key not in without}
+    """Fields of a configuration object, except those that begin with ``_`` and those in
+    ``without``."""
+    return {
+        key: value
+        for key, value in config.fields.items()
+        if not str(key).startswith("_") and key not in without
+    }
 
 
 def step_of(checkpoint: Path) -> int | None:
@@ -196,24 +227,34 @@ def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Pat
     if chosen is not None:
         return chosen, step_of(chosen) or 0
     place = folder / "nerfstudio_models"
-    if isinstance(configured, Path) and not configured.is_absolute() and (folder / configured).is_dir():
+    if (
+        isinstance(configured, Path)
+        and not configured.is_absolute()
+        and (folder / configured).is_dir()
+    ):
         place = folder / configured
-    steps = {step: file for file in place.glob("step-*.ckpt") if (step := step_of(file)) is not None}
+    steps = {
+        step: file for file in place.glob("step-*.ckpt") if (step := step_of(file)) is not None
+    }
     for step in sorted(steps, reverse=True):
         if is_complete(steps[step]):
             return steps[step], step
         logger.warning("%s: not a complete checkpoint; trying an older one", steps[step])
     checkpoints = f"{len(steps)} incomplete" if steps else "none"
     raise SceneError(
-        f"{folder}: no complete checkpoint in {place.name} ({checkpoints}); let the training reach its first save"
+        f"{folder}: no complete checkpoint in {place.name} ({checkpoints}); let the training "
+        "reach its first save"
     )
 
 
 def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str | None) -> Path:
-    """The data of the run in a folder on this machine: its configured path, from the current folder or from the run's
-    or one above; or at or below ``place``, by as many last names of the configured path as possible."""
+    """The data of the run in a folder on this machine: its configured path, from the current folder
+    or from the run's or one above; or at or below ``place``, by as many last names of the
+    configured path as possible."""
     if named == Path() and place is None:
-        raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
+        raise SceneError(
+            f"{config_path}: names no data folder; expected the photos that the run was trained on"
+        )
     if place is not None:
         names = [name for name in named.parts if name not in (named.anchor, "..", "~")]
         tried = [Path(place, *names[first:]) for first in range(len(names) + 1)]
@@ -228,9 +269,12 @@ def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str 
                 return candidate
     if place is not None:
         raise SceneError(
-            f"{place}: no such folder; expected the data of {config_path}, once at {named}, or a folder above"
+            f"{place}: no such folder; expected the data of {config_path}, once at {named}, or a "
+            "folder above"
         )
-    places = ", ".join(map(str, tried[:3])) + (f" and {len(tried) - 3} more above" if len(tried) > 3 else "")
+    places = ", ".join(map(str, tried[:3])) + (
+        f" and {len(tried) - 3} more above" if len(tried) > 3 else ""
+    )
     raise SceneError(
         f"{config_path}: its data {named} is not there; tried {places}; "
         "name the folder where it is now (--data DIR), or put the data back"
@@ -238,20 +282,32 @@ def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str 
 
 
 def read_transforms(path: Path) -> tuple[Tensor, float]:
-    """The transform (3, 4) and the scale of a ``dataparser_transforms.json``; the identity and 1 if there is none.
-    Raises SceneError if the file is not one."""
+    """The transform (3, 4) and the scale of a ``dataparser_transforms.json``; the identity and 1 if
+    there is none. Raises SceneError if the file is not one."""
     if not path.is_file():
         return torch.eye(4, **FLOATS)[:3], 1.0
     try:
         content = json.loads(read_text(path, 1 << 16))  # nerfstudio writes some hundreds of bytes
         transform = torch.tensor(content["transform"], **FLOATS)
         scale = float(content["scale"])
-    except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError, RuntimeError) as error:
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        OverflowError,
+        RecursionError,
+        RuntimeError,
+    ) as error:
         why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)
         raise SceneError(
             f"{path}: not a dataparser transform ({why}); expected 'transform' (3 x 4) and 'scale'"
         ) from error
-    if transform.shape != (3, 4) or not transform.isfinite().all() or not (math.isfinite(scale) and scale > 0):
+    if (
+        transform.shape != (3, 4)
+        or not transform.isfinite().all()
+        or not (math.isfinite(scale) and scale > 0)
+    ):
         raise SceneError(
             f"{path}: transform of shape {tuple(transform.shape)}, scale {scale}; "
             "expected 3 x 4 finite numbers and a positive scale"

@@ -1,4 +1,5 @@
-"""Checkpoints: Splatfacto's (``nerfstudio_models/step-*.ckpt``) and gsplat's (``ckpts/ckpt_*_rank0.pt``)."""
+"""Checkpoints: Splatfacto's (``nerfstudio_models/step-*.ckpt``) and gsplat's
+(``ckpts/ckpt_*_rank0.pt``)."""
 
 from __future__ import annotations
 
@@ -25,28 +26,34 @@ EXPECTED = "expected a checkpoint that Splatfacto or gsplat saved"
 def read_checkpoint(path: Path | str) -> Gaussians:
     """Read the scene of a checkpoint of Splatfacto, or of gsplat's trainer.
 
-    Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto stores colours as
-    logits, they are converted to SH coefficients of the same colour. The ``cfg.yml`` of a training with gsplat says
-    whether it drew antialiased.
+    Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto
+    stores colours as logits, they are converted to SH coefficients of the same colour. The
+    ``cfg.yml`` of a training with gsplat says whether it drew antialiased.
 
     Returns:
-        The scene, float32 on the CPU, in the frame of the training: for Splatfacto that of the run's dataparser.
+        The scene, float32 on the CPU, in the frame of the training: for Splatfacto that of the
+        run's dataparser.
 
     Raises:
-        SceneError: if the file is truncated, is no checkpoint, is one of another method, or a part of one.
+        SceneError: if the file is truncated, is no checkpoint, is one of another method, or a part
+            of one.
     """
     path = require_file(path, "a checkpoint")
     named = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)
     if named is not None and path.with_name(f"{named[1]}1.pt").exists():
         raise SceneError(
-            f"{path}: a part of a training on several GPUs; expected the whole scene; export a PLY with --save_ply"
+            f"{path}: a part of a training on several GPUs; expected the whole scene; export a "
+            "PLY with --save_ply"
         )
     content = _load(path)
-    if isinstance(content, dict) and isinstance(content.get("splats"), dict):  # of gsplat's simple_trainer
+    if isinstance(content, dict) and isinstance(
+        content.get("splats"), dict
+    ):  # of gsplat's simple_trainer
         scene = _scene_of_gsplat(content["splats"], path)
         return scene.replace(antialiased=_gsplat_antialiased(path))
     state = _pipeline_state(content, path)
-    # Of current versions, and of those before nerfstudio 1.0, each also with the wrapper of distributed training.
+    # Of current versions, and of those before nerfstudio 1.0, each also with the wrapper of
+    # distributed training.
     prefixes = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
     prefix = next((p for p in prefixes if f"{p}means" in state), None)
     if prefix is None:
@@ -54,15 +61,17 @@ def read_checkpoint(path: Path | str) -> Gaussians:
             f"{path}: a checkpoint of another method; found the keys {_some(state, 4)}; "
             f"expected {prefixes[0]}means, as Splatfacto saves"
         )
-    scene = _scene_of({name: (prefix + name, state.get(prefix + name)) for name in PARAMETERS}, path)
+    scene = _scene_of(
+        {name: (prefix + name, state.get(prefix + name)) for name in PARAMETERS}, path
+    )
     if scene.sh_degree == 0:
         scene = scene.replace(features_dc=(torch.sigmoid(scene.features_dc) - 0.5) / SH_C0)
     return scene
 
 
 def _gsplat_antialiased(path: Path) -> bool:
-    """Whether the settings of a training with gsplat, ``cfg.yml`` above the checkpoint's folder, say that it drew
-    antialiased; False if there are none."""
+    """Whether the settings of a training with gsplat, ``cfg.yml`` above the checkpoint's folder,
+    say that it drew antialiased; False if there are none."""
     try:
         text = read_text(path.absolute().parents[1] / "cfg.yml", 1 << 20)
     except (OSError, ValueError, IndexError):
@@ -72,7 +81,10 @@ def _gsplat_antialiased(path: Path) -> bool:
 
 def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
     """The scene of gsplat's parameters: opacities (N,), and constant SH coefficients (N, 1, 3)."""
-    keys = dict(zip(PARAMETERS, PARAMETERS, strict=True)) | {"features_dc": "sh0", "features_rest": "shN"}
+    keys = dict(zip(PARAMETERS, PARAMETERS, strict=True)) | {
+        "features_dc": "sh0",
+        "features_rest": "shN",
+    }
     held = {name: splats.get(key) for name, key in keys.items()}
     if isinstance(opacities := held["opacities"], Tensor) and opacities.dim() == 1:
         held["opacities"] = opacities[:, None]
@@ -82,9 +94,12 @@ def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
 
 
 def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
-    """The scene of parameters, each with its key in the file; those that cannot be drawn included."""
+    """The scene of parameters, each with its key in the file; those that cannot be drawn
+    included."""
     limit = path.stat().st_size
-    require_memory(path, min(limit, sum(4 * value.numel() for _, value in values.values() if _is_dense(value))))
+    require_memory(
+        path, min(limit, sum(4 * value.numel() for _, value in values.values() if _is_dense(value)))
+    )
     tensors = {name: _parameter(value, key, path, limit) for name, (key, value) in values.items()}
     try:
         return Gaussians(*(tensors[name] for name in PARAMETERS))
@@ -95,7 +110,9 @@ def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
 def _some(keys: Iterable[Any], count: int) -> str:
     """The first of some keys, and how many more there are."""
     names = sorted(str(key) for key in keys)
-    return (", ".join(names[:count]) or "none") + (f" and {len(names) - count} more" if len(names) > count else "")
+    return (", ".join(names[:count]) or "none") + (
+        f" and {len(names) - count} more" if len(names) > count else ""
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,17 +120,20 @@ class PhotoFit:
     """What a training learned about each of its photos, beside the scene."""
 
     adjustments: Tensor | None
-    """(C, 6) float32: of each training photo's pose a translation in scene units, then a rotation vector in radians;
-    None if poses were not corrected."""
+    """(C, 6) float32: of each training photo's pose a translation in scene units, then a rotation
+    vector in radians; None if poses were not corrected."""
     colors: str
-    """Key of parameters that change the colours of each photo, such as a bilateral grid; empty if there are none."""
+    """Key of parameters that change the colours of each photo, such as a bilateral grid; empty if
+    there are none."""
 
 
 def read_photo_fit(path: Path | str) -> PhotoFit:
-    """Read what a Splatfacto checkpoint holds about each training photo. Loads as :func:`read_checkpoint`.
+    """Read what a Splatfacto checkpoint holds about each training photo. Loads as
+    :func:`read_checkpoint`.
 
     Raises:
-        SceneError: if the file is no checkpoint, or its corrections of poses are not (C, 6) finite numbers.
+        SceneError: if the file is no checkpoint, or its corrections of poses are not (C, 6) finite
+            numbers.
     """
     path = require_file(path, "a Splatfacto checkpoint")
     state = _pipeline_state(_load(path), path)
@@ -124,10 +144,13 @@ def read_photo_fit(path: Path | str) -> PhotoFit:
         adjustments.dim() == 2 and adjustments.shape[1] == 6 and bool(adjustments.isfinite().all())
     ):
         raise SceneError(
-            f"{path}: {key!r} of shape {tuple(adjustments.shape)}; expected six finite numbers for each training photo"
+            f"{path}: {key!r} of shape {tuple(adjustments.shape)}; expected six finite numbers "
+            "for each training photo"
         )
     words = re.compile(r"bil_?grid|bilateral|appearance|embed|exposure")
-    colors = next((name for name in sorted(names) if name.startswith("_model.") and words.search(name)), "")
+    colors = next(
+        (name for name in sorted(names) if name.startswith("_model.") and words.search(name)), ""
+    )
     return PhotoFit(adjustments, colors)
 
 
@@ -142,13 +165,16 @@ def is_complete(path: Path) -> bool:
 def allow_splatfacto_checkpoints() -> None:
     """Register numpy's float64 scalars with torch's ``weights_only`` loader, if they are not.
 
-    Every Splatfacto checkpoint holds such a scalar in the state of its schedulers. The functions registered here
-    rebuild it from its bytes; they cannot run code from the file.
+    Every Splatfacto checkpoint holds such a scalar in the state of its schedulers. The functions
+    registered here rebuild it from its bytes; they cannot run code from the file.
     """
     # numpy 2 renamed the module.
-    scalar = importlib.import_module(f"numpy.{'_core' if hasattr(np, '_core') else 'core'}.multiarray").scalar
+    scalar = importlib.import_module(
+        f"numpy.{'_core' if hasattr(np, '_core') else 'core'}.multiarray"
+    ).scalar
     allowed: list[Any] = [np.dtype, type(np.dtype(np.float64))]
-    # A checkpoint may come from the other major version of numpy, so register the function under both names.
+    # A checkpoint may come from the other major version of numpy, so register the function under
+    # both names.
     allowed += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     present = torch.serialization.get_safe_globals()
     torch.serialization.add_safe_globals([entry for entry in allowed if entry not in present])
@@ -160,7 +186,9 @@ def _load(path: Path) -> Any:
         raise SceneError(f"{path}: the file is empty; {EXPECTED}")
     archive = is_complete(path)
     if not archive and path.open("rb").read(2) == b"PK":
-        raise SceneError(f"{path}: truncated, the archive has no end; {EXPECTED}; train or copy it again")
+        raise SceneError(
+            f"{path}: truncated, the archive has no end; {EXPECTED}; train or copy it again"
+        )
     allow_splatfacto_checkpoints()
     try:
         if archive:
@@ -182,14 +210,15 @@ def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
     if not isinstance(state, dict):
         found = _some(content, 6) if isinstance(content, dict) else type(content).__name__
         raise SceneError(
-            f"{path}: not a checkpoint of a scene; found {found}; expected the key 'pipeline' of nerfstudio, or "
-            "'splats' of gsplat"
+            f"{path}: not a checkpoint of a scene; found {found}; expected the key 'pipeline' of "
+            "nerfstudio, or 'splats' of gsplat"
         )
     return state
 
 
 def _is_dense(value: Any) -> TypeGuard[Tensor]:
-    """Whether a value is a tensor of plain numbers: not one that is nested, sparse, quantised or without content."""
+    """Whether a value is a tensor of plain numbers: not one that is nested, sparse, quantised or
+    without content."""
     if not isinstance(value, Tensor) or value.is_nested:
         return False
     floats = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -201,8 +230,14 @@ def _parameter(value: Any, key: str, path: Path, limit: int) -> Tensor:
     if value is None:
         raise SceneError(f"{path}: lacks the key {key!r}; {EXPECTED}")
     if not _is_dense(value):
-        kind = f"{value.dtype} {value.layout} on {value.device}" if isinstance(value, Tensor) else type(value).__name__
+        kind = (
+            f"{value.dtype} {value.layout} on {value.device}"
+            if isinstance(value, Tensor)
+            else type(value).__name__
+        )
         raise SceneError(f"{path}: {key!r} is {kind}; expected a dense floating-point tensor")
     if value.numel() * value.element_size() > limit:
-        raise SceneError(f"{path}: {key!r} has shape {tuple(value.shape)}, more than the file can hold")
+        raise SceneError(
+            f"{path}: {key!r} has shape {tuple(value.shape)}, more than the file can hold"
+        )
     return value.detach().to(torch.float32, copy=True, memory_format=torch.contiguous_format)

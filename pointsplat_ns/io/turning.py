@@ -10,24 +10,32 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians, Offset
 from pointsplat_ns.geometry.harmonics import sh_matrix
-from pointsplat_ns.geometry.transforms import axis_along, direction_of, quaternions_of, zero_as_identity
+from pointsplat_ns.geometry.transforms import (
+    axis_along,
+    direction_of,
+    quaternions_of,
+    zero_as_identity,
+)
 from pointsplat_ns.system.tensors import DOUBLES
 
 
 def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaussians:
-    """A scene whose positions, rotations, SH and declared up axis are turned about the origin. An up direction that is
-    no axis any more is not declared.
+    """A scene whose positions, rotations, SH and declared up axis are turned about the origin. An
+    up direction that is no axis any more is not declared.
 
     Args:
         scene: N Gaussians.
-        matrix: (3, 3) float64, orthogonal: the factor on positions. A determinant of -1 mirrors. A reflection through
-            the origin leaves covariances, and so the rotations of Gaussians, unchanged.
-        quat: (4,) wxyz, unit: the rotation in the matrix, by default computed. Its sign is that of the quaternions.
+        matrix: (3, 3) float64, orthogonal: the factor on positions. A determinant of -1 mirrors. A
+            reflection through the origin leaves covariances, and so the rotations of Gaussians,
+            unchanged.
+        quat: (4,) wxyz, unit: the rotation in the matrix, by default computed. Its sign is that of
+            the quaternions.
     """
     from kornia.geometry.quaternion import Quaternion
 
     like = scene.means
-    rest, first = [], 0
+    rest = []
+    first = 0
     for degree in range(1, scene.sh_degree + 1):
         size = 2 * degree + 1
         band = scene.features_rest[:, first : first + size]
@@ -63,10 +71,13 @@ class Similarity:
 
     def inverse(self) -> Similarity:
         """The similarity that undoes this one."""
-        return Similarity(self.matrix.T, 1 / self.scale, -(self.matrix.T @ self.offset) / self.scale)
+        return Similarity(
+            self.matrix.T, 1 / self.scale, -(self.matrix.T @ self.offset) / self.scale
+        )
 
     def apply(self, scene: Gaussians) -> Gaussians:
-        """The scene after the transform. Its SH are turned too; a mirrored scene has mirrored SH."""
+        """The scene after the transform. Its SH are turned too; a mirrored scene has mirrored
+        SH."""
         moved = turned(scene.to(dtype=torch.float64), self.matrix)
         return moved.replace(
             means=moved.means * self.scale + self.offset.to(moved.means),

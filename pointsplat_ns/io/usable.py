@@ -9,15 +9,19 @@ from pointsplat_ns.io.files import logger
 
 
 def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
-    """``scene`` without infinite values, and without the Gaussians that cannot be drawn, whose number is logged.
+    """``scene`` without infinite values, and without the Gaussians that cannot be drawn, whose
+    number is logged.
 
     Opacity logits of +-Inf (opacity 1 and 0) and log-scales of -Inf (a flat axis) can be drawn (see
-    :meth:`~pointsplat_ns.gaussians.Gaussians.usable`). They become +-30 and -87, which draw the same in float32.
+    :meth:`~pointsplat_ns.gaussians.Gaussians.usable`). They become +-30 and -87, which draw the
+    same in float32.
     """
     usable = usable_part(scene)
     dropped = len(scene) - len(usable)
     if dropped:
-        logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", path, dropped, len(scene))
+        logger.warning(
+            "%s: dropped %d of %d Gaussians with NaN or infinite values", path, dropped, len(scene)
+        )
     return usable
 
 

@@ -15,13 +15,18 @@ from pointsplat_ns.io.files import replacing, write_json
 
 
 def check_folder(folder: Path, names: Iterable[str], force: bool) -> None:
-    """Raise a SceneError, before the long computations, if files may not be written to a folder: it is a file or named
-    like one, or holds one of these files, which must not be overwritten."""
-    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png", ".rad") or (folder.exists() and not folder.is_dir()):
+    """Raise a SceneError, before the long computations, if files may not be written to a folder: it
+    is a file or named like one, or holds one of these files, which must not be overwritten."""
+    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png", ".rad") or (
+        folder.exists() and not folder.is_dir()
+    ):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
     for name in names:
         if (folder / name).exists() and not force:
-            raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
+            raise SceneError(
+                f"{folder / name}: exists already; name another folder, or overwrite it with "
+                "--force"
+            )
 
 
 def write_levels(
@@ -33,8 +38,8 @@ def write_levels(
 ) -> None:
     """Write all levels and their manifest, or nothing.
 
-    All files are written beside before the first replaces an older one. Meanwhile there is no manifest, so that a
-    folder with it is whole.
+    All files are written beside before the first replaces an older one. Meanwhile there is no
+    manifest, so that a folder with it is whole.
 
     Args:
         folder: created if it is missing.
@@ -43,7 +48,8 @@ def write_levels(
         force: whether existing files may be overwritten.
 
     Raises:
-        SceneError: if the folder cannot be used, see :func:`check_folder`, or a file cannot be written.
+        SceneError: if the folder cannot be used, see :func:`check_folder`, or a file cannot be
+            written.
     """
     folder = Path(folder)
     check_folder(folder, level_names(len(levels)), force)
@@ -58,7 +64,9 @@ def write_levels(
         for scene, fact, name in zip(levels, facts, level_names(len(levels))[1:], strict=True):
             part = part_of(name)
             write_ply(scene, part)
-            rows.append({"file": name, "bytes": part.stat().st_size, "sha256": content_hash(part), **fact})
+            rows.append(
+                {"file": name, "bytes": part.stat().st_size, "sha256": content_hash(part), **fact}
+            )
         write_json({"format": "pointsplat-lod", "version": 2, **about, "levels": rows}, manifest)
         (folder / FOLDER_FILES.levels).unlink(missing_ok=True)
 

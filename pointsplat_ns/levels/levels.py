@@ -1,7 +1,8 @@
-"""Levels of detail: a scene merged to ever fewer Gaussians in one pass, with the error of each level.
+"""Levels of detail: a scene merged to ever fewer Gaussians in one pass, with the error of each
+level.
 
-Each level is merged from the level before, so levels are nested: every Gaussian has one parent in the next coarser
-level. A repair moves the Gaussians of a level, and keeps their parents.
+Each level is merged from the level before, so levels are nested: every Gaussian has one parent in
+the next coarser level. A repair moves the Gaussians of a level, and keeps their parents.
 """
 
 from __future__ import annotations
@@ -51,9 +52,12 @@ class Level:
 
     scene: Gaussians
     """K Gaussians."""
-    assignment: Tensor  # [N] int64, index in ``scene`` for each Gaussian of the dense scene; -1 if dropped
+    assignment: (
+        Tensor  # [N] int64, index in ``scene`` for each Gaussian of the dense scene; -1 if dropped
+    )
     dropped: int
-    """Number of Gaussians of the dense scene without a place in this level, because they are too faint to be drawn."""
+    """Number of Gaussians of the dense scene without a place in this level, because they are too
+    faint to be drawn."""
     quality: Quality | None
     """How close its renders are to the dense scene's; None if there is no view."""
     seconds: float
@@ -62,7 +66,8 @@ class Level:
     """The repair of the level, kept or not; None if there was none."""
 
     def facts(self, whole: int) -> dict[str, Any]:
-        """The manifest's entry of the level; ``whole`` is the number of Gaussians of the dense scene."""
+        """The manifest's entry of the level; ``whole`` is the number of Gaussians of the dense
+        scene."""
         near = self.quality
         return {
             "count": len(self.scene),
@@ -79,7 +84,8 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels of detail of a scene. ``len``, indices and iteration give each :class:`Level`, the finest first.
+    """Levels of detail of a scene. ``len``, indices and iteration give each :class:`Level`, the
+    finest first.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -118,11 +124,13 @@ class Levels:
 
     @property
     def parents(self) -> list[Tensor]:
-        """For each level but the last, the index (M,) int64 in the next of the parent of each Gaussian; -1 if it is
-        dropped."""
+        """For each level but the last, the index (M,) int64 in the next of the parent of each
+        Gaussian; -1 if it is dropped."""
         found = []
         for finer, coarser in zip(self.levels, self.levels[1:], strict=False):
-            parents = torch.full((len(finer.scene),), -1, dtype=torch.int64, device=finer.assignment.device)
+            parents = torch.full(
+                (len(finer.scene),), -1, dtype=torch.int64, device=finer.assignment.device
+            )
             kept = finer.assignment >= 0
             parents[finer.assignment[kept]] = coarser.assignment[kept]
             found.append(parents)
@@ -147,13 +155,20 @@ class Levels:
         Raises:
             SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
         """
-        dense, file, of = self.dense, self.source, self.views
+        dense = self.dense
+        file = self.source
+        of = self.views
         boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
         if (content := content_box(dense)) is not None:
             boxes["content"] = content
         views = None
         if of is not None:
-            views = {"count": len(of), "origin": self.origin, "width": of.width, "height": of.height}
+            views = {
+                "count": len(of),
+                "origin": self.origin,
+                "width": of.width,
+                "height": of.height,
+            }
         source = {
             "file": file and file.name,
             "bytes": file and file.bytes,
@@ -161,22 +176,28 @@ class Levels:
             "count": len(dense),
             "sh_degree": dense.sh_degree,
         }
-        bounds = {name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()}
+        bounds = {
+            name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()
+        }
         about = {"source": source, "bounds": bounds, "views": views}
         write_levels(folder, self.scenes, about, [level.facts(len(dense)) for level in self], force)
 
     def pixel_sizes(self) -> list[float]:
-        """Scene units a pixel from which on each level shows enough; without views, the typical size of its
-        Gaussians."""
-        near, found = [level.quality.psnr for level in self if level.quality is not None], None
+        """Scene units a pixel from which on each level shows enough; without views, the typical
+        size of its Gaussians."""
+        near = [level.quality.psnr for level in self if level.quality is not None]
+        found = None
         if self.views is not None:
-            found = pixel_sizes(self.dense, DenseReference(self.dense, self.views), self.scenes, near)
+            found = pixel_sizes(
+                self.dense, DenseReference(self.dense, self.views), self.scenes, near
+            )
         return found or [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
 
 
 @dataclass(frozen=True)
 class LevelOutput:
-    """Where levels are written, and in which form. Raises PointSplatError if options do not fit each other."""
+    """Where levels are written, and in which form. Raises PointSplatError if options do not fit
+    each other."""
 
     path: Path
     """A folder; of the form "paged" a file."""
@@ -189,25 +210,39 @@ class LevelOutput:
 
     @classmethod
     def of(
-        cls, path: str | Path | None, stream: bool, tiles: bool, at: str | None, up: str | None, force: bool
+        cls,
+        path: str | Path | None,
+        stream: bool,
+        tiles: bool,
+        at: str | None,
+        up: str | None,
+        force: bool,
     ) -> LevelOutput | None:
         """The output of options of :func:`pointsplat_ns.lod`; None if nothing is written."""
         if stream and tiles or at is not None and not tiles:
-            raise PointSplatError("expected either a stream or 3D Tiles, and a place on the Earth with tiles alone")
+            raise PointSplatError(
+                "expected either a stream or 3D Tiles, and a place on the Earth with tiles alone"
+            )
         if at is not None:
             Place.parse(at)
         if path is None:
             return None
         paged = Path(path).suffix.lower() == ".rad"
         return cls(
-            Path(path), "stream" if stream else "tiles" if tiles else "paged" if paged else "folder", at, up, force
+            Path(path),
+            "stream" if stream else "tiles" if tiles else "paged" if paged else "folder",
+            at,
+            up,
+            force,
         )
 
     def check(self, count: int) -> None:
         """Check that ``count`` levels can be written."""
         if self.form == "paged":
             return need_writable(self.path, self.force)
-        names = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}[self.form]
+        names = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}[
+            self.form
+        ]
         check_folder(self.path, names, self.force)
         need_folder(self.path)
 
@@ -225,16 +260,22 @@ class LevelOutput:
         else:
             write_stream(self.path, levels.scenes, levels.parents, progress)
             if levels.judge is not None:
-                read = [levels.judge.quality(read_sog_stream(self.path, index)) for index in range(len(levels))]
-                judged = (replace(level, quality=quality) for level, quality in zip(levels, read, strict=True))
+                read = [
+                    levels.judge.quality(read_sog_stream(self.path, index))
+                    for index in range(len(levels))
+                ]
+                judged = (
+                    replace(level, quality=quality)
+                    for level, quality in zip(levels, read, strict=True)
+                )
                 return replace(levels, levels=tuple(judged))
         return levels
 
 
 def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
-    """The text and the budget of each level, checked as far as that is possible without the scene: ratios, percentages,
-    counts and sizes as for ``keep``; a text may hold several, separated by spaces. Raises BudgetError if there is none,
-    or a level is not a budget or needs a search."""
+    """The text and the budget of each level, checked as far as that is possible without the scene:
+    ratios, percentages, counts and sizes as for ``keep``; a text may hold several, separated by
+    spaces. Raises BudgetError if there is none, or a level is not a budget or needs a search."""
     levels = levels.split() if isinstance(levels, str) else levels
     if not levels:
         raise BudgetError("no level given; expected at least one, such as 50%")
@@ -247,15 +288,18 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
             raise BudgetError(f"level {text}: {error}") from error
         if found_by_trying(budget):
             raise BudgetError(
-                f"level {text}: expected a ratio (0.3), a percentage (30%), a count (50000) or a size (12MB)"
+                f"level {text}: expected a ratio (0.3), a percentage (30%), a count (50000) or a "
+                "size (12MB)"
             )
         parsed.append((text, budget))
     return parsed
 
 
-def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits: Traits) -> list[int]:
-    """The number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if a level does not fit
-    the scene, or two levels have the same number."""
+def level_counts(
+    levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits: Traits
+) -> list[int]:
+    """The number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if
+    a level does not fit the scene, or two levels have the same number."""
     texts: dict[int, str] = {}
     for text, budget in levels:
         try:
@@ -263,7 +307,10 @@ def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits:
         except BudgetError as error:
             raise BudgetError(f"level {text}: {error}") from error
         if count in texts:
-            raise BudgetError(f"levels {texts[count]} and {text} both mean {count} of {n} Gaussians; leave one out")
+            raise BudgetError(
+                f"levels {texts[count]} and {text} both mean {count} of {n} Gaussians; leave one "
+                "out"
+            )
         texts[count] = text
     return sorted(texts, reverse=True)
 
@@ -283,13 +330,16 @@ def make_levels(
         dense: N Gaussians. Undrawable ones are left out first, and their number is logged.
         levels: of :func:`parse_levels`; in any order.
         request: for all Gaussians; its SH bands are those of every level.
-        views: source of the views to compare renders in; merging uses them too where they are known.
+        views: source of the views to compare renders in; merging uses them too where they are
+            known.
         source: the file of ``dense``, for the manifest.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        progress: called with the name of the current task and the share of it that is done, in [0,
+            1].
         budget: of the repair of each level. Levels are merged from unrepaired ones.
 
     Raises:
-        BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
+        BudgetError: if a level does not fit the scene, or two levels have the same number of
+            Gaussians.
         SceneError: if no Gaussian can be drawn.
         DataError: if the SH bands need views and there are none.
     """
@@ -298,25 +348,34 @@ def make_levels(
     progress("rendering the dense scene", 0.0)
     cut = prune_scene(dense, request, views)
     counts = level_counts(levels, len(dense), cut.scene.sh_degree, dense.traits)
-    notes, compared, judge = cut.notes, None, None
+    notes = cut.notes
+    compared = None
+    judge = None
     try:
-        judge, compared = Judge(dense, views), views.compared()
+        judge = Judge(dense, views)
+        compared = views.compared()
     except DataError as error:
         notes = (*notes, f"the levels' errors are not measured: {error}")
     if views.origin and views.text not in notes:
         notes = (views.text, *notes)
-    comparison, at_work = None, dense
+    comparison = None
+    at_work = dense
     if judge is not None and not budget.empty:
         at_work = dense.to(default_device())
         comparison = Comparison(at_work, views)
     made: list[Level] = []
     start = time.perf_counter()
-    for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
-        which, scene, repair = f"level {len(made)}", merged.scene, None
+    for merged in merge_levels(
+        cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()
+    ):
+        which = f"level {len(made)}"
+        scene = merged.scene
+        repair = None
         if comparison is not None and len(scene) < len(cut.scene):
             before = comparison.reference.closeness(scene.to(at_work.device))
             if before.psnr < math.inf:
-                report, merge = within(which, progress), Stage("merge", scene, before)
+                report = within(which, progress)
+                merge = Stage("merge", scene, before)
                 repair = repaired_stage(merge, at_work, budget, comparison, views, report)
                 scene = repair.scene if repair.accepted else scene
                 notes = (*notes, f"{which}: {stage_text(repair)}")

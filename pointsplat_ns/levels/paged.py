@@ -21,7 +21,10 @@ from pointsplat_ns.system.tensors import INDICES
 
 
 def write_paged(
-    path: Path | str, levels: Sequence[Gaussians], parents: Sequence[Tensor], progress: Progress = silent
+    path: Path | str,
+    levels: Sequence[Gaussians],
+    parents: Sequence[Tensor],
+    progress: Progress = silent,
 ) -> int:
     """Write levels of detail as a RAD file. The coarsest is merged on to one Gaussian.
 
@@ -33,9 +36,11 @@ def write_paged(
         The number of Gaussians written.
 
     Raises:
-        SceneError: if a Gaussian has too many children for the format, or the file cannot be written.
+        SceneError: if a Gaussian has too many children for the format, or the file cannot be
+            written.
     """
-    path, kind = Path(path), format_named(".rad")
+    path = Path(path)
+    kind = format_named(".rad")
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
     assert kind is not None
     warn_of_losses(kind, scenes[0], path)
@@ -45,7 +50,10 @@ def write_paged(
         above.append(merged.assignment)
         scenes.append(merged.scene)
     order = torch.zeros(1, **INDICES)
-    parts, children, starts, written = [scenes[-1]], [], [], 1
+    parts = [scenes[-1]]
+    children = []
+    starts = []
+    written = 1
     for scene, coarser, parent in zip(scenes[-2::-1], scenes[:0:-1], above[::-1], strict=True):
         position = torch.full((len(coarser),), -1, **INDICES)
         position[order] = torch.arange(len(order), **INDICES)
@@ -53,8 +61,8 @@ def write_paged(
         counts = torch.tensor([*map(len, families)], **INDICES)
         if int(counts.max()) > MOST_CHILDREN:
             raise SceneError(
-                f"{path}: a Gaussian stands for {int(counts.max())} of the next level; expected at most "
-                f"{MOST_CHILDREN}; make more levels"
+                f"{path}: a Gaussian stands for {int(counts.max())} of the next level; expected at "
+                f"most {MOST_CHILDREN}; make more levels"
             )
         children.append(counts)
         starts.append(written + counts.cumsum(0) - counts)
@@ -62,7 +70,9 @@ def write_paged(
         parts.append(scene[order])
         written += len(order)
     leaves = torch.zeros(len(order), **INDICES)
-    data = encode_rad(Gaussians.cat(parts), torch.cat([*children, leaves]), torch.cat([*starts, leaves]), progress)
+    data = encode_rad(
+        Gaussians.cat(parts), torch.cat([*children, leaves]), torch.cat([*starts, leaves]), progress
+    )
     with replacing(path, len(data)) as part:
         part.write_bytes(data)
     return written

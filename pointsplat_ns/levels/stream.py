@@ -1,7 +1,8 @@
 """Levels of detail as a streamed SOG: which part of which level is a leaf of its tree.
 
-Levels are nested, so a leaf holds the same part of the scene in every level: the descendants of Gaussians of the
-coarsest one. Where two leaves of different levels meet, nothing is drawn twice and nothing is missing.
+Levels are nested, so a leaf holds the same part of the scene in every level: the descendants of
+Gaussians of the coarsest one. Where two leaves of different levels meet, nothing is drawn twice and
+nothing is missing.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ from pointsplat_ns.system.tensors import INDICES
 
 
 def write_stream(
-    folder: Path, levels: Sequence[Gaussians], parents: Sequence[Tensor], progress: Progress = silent
+    folder: Path,
+    levels: Sequence[Gaussians],
+    parents: Sequence[Tensor],
+    progress: Progress = silent,
 ) -> list[int]:
     """Write levels of detail as a streamed SOG, over an older one.
 
@@ -45,16 +49,23 @@ def write_stream(
 
 
 def partition(
-    levels: Sequence[Gaussians], parents: Sequence[Tensor], most: int, extent: float | None = None, least: int = 8192
+    levels: Sequence[Gaussians],
+    parents: Sequence[Tensor],
+    most: int,
+    extent: float | None = None,
+    least: int = 8192,
 ) -> Node:
-    """A tree whose leaves hold the descendants of neighbours in the coarsest level, in Morton order.
+    """A tree whose leaves hold the descendants of neighbours in the coarsest level, in Morton
+    order.
 
     Args:
         levels, parents: as of :func:`write_stream`.
         most: Gaussians of the finest level in a leaf, at most.
-        extent: largest side of a leaf, scene units; by default an eighth of the diagonal of the content.
-        least: Gaussians of the finest level in a leaf, up to which it is not cut for its extent. The tree has one entry
-            for a leaf, and viewers choose a level for each, so that leaves of few Gaussians cost more than they save.
+        extent: largest side of a leaf, scene units; by default an eighth of the diagonal of the
+            content.
+        least: Gaussians of the finest level in a leaf, up to which it is not cut for its extent.
+            The tree has one entry for a leaf, and viewers choose a level for each, so that leaves
+            of few Gaussians cost more than they save.
     """
     coarsest = levels[-1]
     ancestors = [torch.arange(len(coarsest), **INDICES)]
@@ -69,10 +80,16 @@ def partition(
     for number, leaf in enumerate(members):
         leaf_of[leaf] = number
     groups = (torch.where(of >= 0, leaf_of[of.clamp_min(0)], -1) for of in ancestors)
-    rows = [grouped(scene, group, len(members)) for scene, group in zip(levels, groups, strict=True)]
+    rows = [
+        grouped(scene, group, len(members)) for scene, group in zip(levels, groups, strict=True)
+    ]
     filled = iter(Node(rows=leaf) for leaf in zip(*rows, strict=True))
 
     def node(part: Parts) -> Node:
-        return next(filled) if isinstance(part, Tensor) else Node(children=(node(part[0]), node(part[1])))
+        return (
+            next(filled)
+            if isinstance(part, Tensor)
+            else Node(children=(node(part[0]), node(part[1])))
+        )
 
     return node(parts)

@@ -34,18 +34,20 @@ TILESET = "tileset.json"
 def placed(
     levels: Sequence[Gaussians], dense: Gaussians, at: str | None, up: str | None
 ) -> tuple[list[Gaussians], Tensor]:
-    """Levels, float32 on the CPU, about the middle of the coarsest, and the matrix (4, 4) float64 from there to the
-    frame of tiles: that of the scene's file, or the Earth's.
+    """Levels, float32 on the CPU, about the middle of the coarsest, and the matrix (4, 4) float64
+    from there to the frame of tiles: that of the scene's file, or the Earth's.
 
     Args:
         levels: the finest first.
         dense: the scene that they were made of.
-        at: where it lies, see :meth:`~pointsplat_ns.geometry.earth.Place.parse`; None for the frame of its file.
+        at: where it lies, see :meth:`~pointsplat_ns.geometry.earth.Place.parse`; None for the frame
+            of its file.
         up: the axis that is up, if ``at`` is a point; by default the scene's own, or estimated.
     """
     scenes = [scene.detach().to("cpu", torch.float32) for scene in levels]
     middle = from_centre(scenes[-1]).offset or (0.0, 0.0, 0.0)
-    matrix, point = torch.eye(4, **DOUBLES), torch.tensor(middle, **DOUBLES)
+    matrix = torch.eye(4, **DOUBLES)
+    point = torch.tensor(middle, **DOUBLES)
     place = None if at is None else Place.parse(at)
     if place is None:
         matrix[:3, 3] = point
@@ -67,15 +69,17 @@ def write_tiles(
     progress: Progress = silent,
     most: int = 1 << 16,
 ) -> list[int]:
-    """Write levels of detail as 3D Tiles of glTF with SPZ, which CesiumJS draws: all of them, or nothing.
+    """Write levels of detail as 3D Tiles of glTF with SPZ, which CesiumJS draws: all of them, or
+    nothing.
 
-    All files are written beside before the first replaces an older one. Meanwhile there is no ``tileset.json``.
+    All files are written beside before the first replaces an older one. Meanwhile there is no
+    ``tileset.json``.
 
     Args:
         folder: created if it is missing.
         levels: the finest first, float32 on the CPU; z is up.
-        parents: for each level but the last, the index (M,) in the next of the parent of each Gaussian; -1 for those
-            that are too faint to be drawn, which are left out.
+        parents: for each level but the last, the index (M,) in the next of the parent of each
+            Gaussian; -1 for those that are too faint to be drawn, which are left out.
         pixel_sizes: of each level, scene units a pixel from which on it shows enough.
         matrix: (4, 4) float64, from the levels' frame to that of the tiles.
         progress: called while encoding.
@@ -91,10 +95,12 @@ def write_tiles(
     tops = cells(levels, parents, most)
     # CesiumJS refines a tile at an error of 16 pixels, by default
     errors = [16.0 * size for size in itertools.accumulate(pixel_sizes, max)]
-    counts, number = [0] * len(levels), itertools.count()
+    counts = [0] * len(levels)
+    number = itertools.count()
 
     def tile(cell: Cell) -> dict[str, Any]:
-        scene, index = levels[cell.level][cell.rows], next(number)
+        scene = levels[cell.level][cell.rows]
+        index = next(number)
         progress("writing tiles", sum(counts) / sum(map(len, levels)))
         low, high = _box(scene)
         x, y, z = (0.5 * (low + high)).tolist()
@@ -109,8 +115,12 @@ def write_tiles(
     with ExitStack() as stack:
         part = stack.enter_context(replacing(folder / TILESET))  # entered first, left last
         root = _node(None, [tile(top) for top in tops], max(errors))
-        root["geometricError"] = max(root["geometricError"], 2 * sum(root["boundingVolume"]["box"][3::4]))
-        extensions = {name: list(TILE_EXTENSIONS) for name in ("extensionsUsed", "extensionsRequired")}
+        root["geometricError"] = max(
+            root["geometricError"], 2 * sum(root["boundingVolume"]["box"][3::4])
+        )
+        extensions = {
+            name: list(TILE_EXTENSIONS) for name in ("extensionsUsed", "extensionsRequired")
+        }
         tileset = {
             "asset": {"version": "1.1", "generator": "pointsplat-ns"},
             "extensionsUsed": ["3DTILES_content_gltf"],
@@ -124,18 +134,24 @@ def write_tiles(
 
 
 def _box(scene: Gaussians) -> tuple[Tensor, Tensor]:
-    """The corners of the box of all centres and of three times the middle size about them. That of the largest
-    Gaussians would be so large that viewers would refine what is far away."""
+    """The corners of the box of all centres and of three times the middle size about them. That of
+    the largest Gaussians would be so large that viewers would refine what is far away."""
     margin = 3 * typical_sizes(scene).median()
     return scene.means.double().amin(dim=0) - margin, scene.means.double().amax(dim=0) + margin
 
 
 def _node(corners: Tensor | None, children: list[dict[str, Any]], error: float) -> dict[str, Any]:
     """A tile without content, with the box of its own corners (2, 3) and those of its children."""
-    boxes = torch.tensor([child["boundingVolume"]["box"] for child in children], **DOUBLES).reshape(-1, 12)
-    middle, half = boxes[:, :3], boxes[:, 3::4]
+    boxes = torch.tensor([child["boundingVolume"]["box"] for child in children], **DOUBLES).reshape(
+        -1, 12
+    )
+    middle = boxes[:, :3]
+    half = boxes[:, 3::4]
     points = torch.cat([middle - half, middle + half, *([] if corners is None else [corners])])
     low, high = points.aminmax(dim=0)
     axes = torch.diag(0.5 * (high - low)).flatten().tolist()
-    node = {"boundingVolume": {"box": [*(0.5 * (low + high)).tolist(), *axes]}, "geometricError": error}
+    node = {
+        "boundingVolume": {"box": [*(0.5 * (low + high)).tolist(), *axes]},
+        "geometricError": error,
+    }
     return {**node, "children": children} if children else node

@@ -1,4 +1,5 @@
-"""Cells of nested levels: parts of a scene that hold the descendants of neighbours in a coarser level."""
+"""Cells of nested levels: parts of a scene that hold the descendants of neighbours in a coarser
+level."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ Parts: TypeAlias = "Tensor | tuple[Parts, Parts]"
 
 @dataclass(eq=False)
 class Cell:
-    """A part of one level; the finer level's part in the same place is that of its children together."""
+    """A part of one level; the finer level's part in the same place is that of its children
+    together."""
 
     level: int
     """0 is the finest."""
@@ -29,15 +31,19 @@ class Cell:
     children: list[Cell] = field(default_factory=list)
 
 
-def halved(points: Tensor, weights: Tensor, most: int, extent: float = math.inf, least: int = 0) -> Parts:
-    """Points (N, 3) cut at the middle of their weight (N,) along their longest side, again and again.
+def halved(
+    points: Tensor, weights: Tensor, most: int, extent: float = math.inf, least: int = 0
+) -> Parts:
+    """Points (N, 3) cut at the middle of their weight (N,) along their longest side, again and
+    again.
 
-    A part is cut if it has more than one point, and a larger weight than ``most``, or a side longer than ``extent`` and
-    a larger weight than ``least``.
+    A part is cut if it has more than one point, and a larger weight than ``most``, or a side longer
+    than ``extent`` and a larger weight than ``least``.
     """
 
     def split(members: Tensor) -> Parts:
-        part, weight = points[members], weights[members]
+        part = points[members]
+        weight = weights[members]
         total = int(weight.sum())
         sides = part.amax(dim=0) - part.amin(dim=0) if len(members) else torch.zeros(3, **FLOATS)
         too_wide = float(sides.max()) > extent and total > least
@@ -53,7 +59,9 @@ def halved(points: Tensor, weights: Tensor, most: int, extent: float = math.inf,
 
 def leaves(parts: Parts) -> list[Tensor]:
     """The parts that are not cut, in order."""
-    return [parts] if isinstance(parts, Tensor) else [leaf for part in parts for leaf in leaves(part)]
+    return (
+        [parts] if isinstance(parts, Tensor) else [leaf for part in parts for leaf in leaves(part)]
+    )
 
 
 def grouped(scene: Gaussians, group: Tensor, count: int) -> tuple[Tensor, ...]:
@@ -69,8 +77,8 @@ def cells(levels: Sequence[Gaussians], parents: Sequence[Tensor], most: int) -> 
 
     Args:
         levels: the finest first.
-        parents: for each level but the last, the index (M,) in the next of the parent of each Gaussian; -1 for those
-            that are left out.
+        parents: for each level but the last, the index (M,) in the next of the parent of each
+            Gaussian; -1 for those that are left out.
         most: Gaussians in a cell, but for children of one parent, which stay together.
     """
     top = Cell(len(levels), torch.arange(len(levels[-1]), **INDICES))

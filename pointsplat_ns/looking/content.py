@@ -1,4 +1,5 @@
-"""The content of a scene: its centre and size, the scene in units of it, and fewer Gaussians that cover as much."""
+"""The content of a scene: its centre and size, the scene in units of it, and fewer Gaussians that
+cover as much."""
 
 from __future__ import annotations
 
@@ -13,18 +14,20 @@ from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
 UNITS = 10.0
-"""Diagonal of the content after :func:`in_units`. The sizes that rendering knows, such as its near plane, are small
-against it."""
+"""Diagonal of the content after :func:`in_units`. The sizes that rendering knows, such as its near
+plane, are small against it."""
 
 
 def content_box(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
-    """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, scene units, float64; None
-    if nothing of the scene is visible."""
-    means, alphas = scene.means.double(), scene.alphas.double()
+    """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, scene
+    units, float64; None if nothing of the scene is visible."""
+    means = scene.means.double()
+    alphas = scene.alphas.double()
     visible = scene.usable() & (alphas > 0)
     if not bool(visible.any()):
         return None
-    means, alphas = means[visible], alphas[visible]
+    means = means[visible]
+    alphas = alphas[visible]
     corners = []
     for axis in means.unbind(1):
         ranked, order = axis.sort()
@@ -38,8 +41,9 @@ def content_box(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
 def content_size(scene: Gaussians) -> tuple[Tensor, float]:
     """Centre (3,), float64, on the CPU, and diagonal of the content of a scene, scene units.
 
-    If the content is a point (one Gaussian, or all at one position), the diagonal is four times the largest standard
-    deviation, or 1 if that is 0 or not finite. A scene that shows nothing has its centre at 0 and a diagonal of 1.
+    If the content is a point (one Gaussian, or all at one position), the diagonal is four times the
+    largest standard deviation, or 1 if that is 0 or not finite. A scene that shows nothing has its
+    centre at 0 and a diagonal of 1.
     """
     box = content_box(scene)
     if box is None:
@@ -50,8 +54,8 @@ def content_size(scene: Gaussians) -> tuple[Tensor, float]:
 
 
 def in_units(scene: Gaussians, centre: Tensor, size: float) -> Gaussians:
-    """A scene moved and scaled so that the content has its centre at 0 and a diagonal of :data:`UNITS`; positions are
-    computed in float64."""
+    """A scene moved and scaled so that the content has its centre at 0 and a diagonal of
+    :data:`UNITS`; positions are computed in float64."""
     means = (scene.means.double() - centre.to(scene.device)) * (UNITS / size)
     return scene.replace(means=means.to(scene.dtype), scales=scene.scales + math.log(UNITS / size))
 
@@ -62,12 +66,16 @@ def views_in_units(views: Views, centre: Tensor, size: float) -> Views:
     viewmats[:, :3, 3] += viewmats[:, :3, :3] @ centre
     viewmats[:, :3, 3] *= UNITS / size
     near_plane = views.near_plane * UNITS / size
-    Ks, background = views.Ks.double().cpu(), views.background.cpu()
-    return dataclasses.replace(views, viewmats=viewmats, Ks=Ks, background=background, near_plane=near_plane)
+    Ks = views.Ks.double().cpu()
+    background = views.background.cpu()
+    return dataclasses.replace(
+        views, viewmats=viewmats, Ks=Ks, background=background, near_plane=near_plane
+    )
 
 
 def in_scene_units(views: Views, centre: Tensor, size: float) -> Views:
-    """Views in units of the content, changed into views of the scene: the opposite of :func:`views_in_units`."""
+    """Views in units of the content, changed into views of the scene: the opposite of
+    :func:`views_in_units`."""
     viewmats = views.viewmats.clone()
     viewmats[:, :3, 3] *= size / UNITS
     viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ centre
@@ -80,14 +88,15 @@ def thinning(count: int, max_count: int) -> int:
 
 
 def thinned(scene: Gaussians, max_count: int) -> Gaussians:
-    """Every so many-th Gaussian, about ``max_count`` at most, enlarged so that they cover as much as all."""
+    """Every so many-th Gaussian, about ``max_count`` at most, enlarged so that they cover as much
+    as all."""
     step = thinning(len(scene), max_count)
     return enlarged(scene[::step], step)
 
 
 def every_nth(scene: Gaussians, members: Tensor, step: int) -> Gaussians:
-    """Every ``step``-th of the Gaussians with indices ``members`` (n,), without SH, enlarged so that they cover as much
-    as all members."""
+    """Every ``step``-th of the Gaussians with indices ``members`` (n,), without SH, enlarged so
+    that they cover as much as all members."""
     return enlarged(scene.replace(features_rest=scene.features_rest[:, :0])[members[::step]], step)
 
 

@@ -1,8 +1,10 @@
-"""The views in which people see a scene first: its subject whole and upright, or from where people stood.
+"""The views in which people see a scene first: its subject whole and upright, or from where people
+stood.
 
-A person who opens a scene wants one picture that shows what it is, and then others. An object is shown whole: people
-are as likely to take a picture of all of it (:mod:`~pointsplat_ns.looking.sampling`) as others. In a room or
-outdoors, where nobody stands outside of everything, they are not.
+A person who opens a scene wants one picture that shows what it is, and then others. An object is
+shown whole: people are as likely to take a picture of all of it
+(:mod:`~pointsplat_ns.looking.sampling`) as others. In a room or outdoors, where nobody stands
+outside of everything, they are not.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ class Opening:
     """The first is the one that a viewer opens with."""
     up: Up
     whole: bool
-    """Whether the first view shows all of the scene from outside: an object to circle around, no room."""
+    """Whether the first view shows all of the scene from outside: an object to circle around, no
+    room."""
 
 
 @torch.no_grad()
@@ -41,9 +44,9 @@ def opening_views(
 ) -> Opening:
     """The views in which to show a scene first.
 
-    If a view from around the scene, which shows all of it, is at least as likely as half of the known views, or of
-    sampled ones, it comes first, and others of its kind or known ones follow. Else known or sampled views come, the
-    likeliest first. Views complete each other.
+    If a view from around the scene, which shows all of it, is at least as likely as half of the
+    known views, or of sampled ones, it comes first, and others of its kind or known ones follow.
+    Else known or sampled views come, the likeliest first. Views complete each other.
 
     Args:
         scene: N Gaussians.
@@ -51,7 +54,8 @@ def opening_views(
         width: of the pictures, pixels, if the views are not known ones.
         height: of the pictures, pixels.
         up: which way is up; by default what the scene declares, or estimated.
-        known: views that people took or chose. Their size, background and rasterize mode apply to all views.
+        known: views that people took or chose. Their size, background and rasterize mode apply to
+            all views.
 
     Raises:
         DataError: if nothing of the scene is visible.
@@ -67,9 +71,16 @@ def opening_views(
         return Opening(others[sampler.completing(likelihoods, shown, count)], sampler.up, False)
     outside = in_scene_units(outside, *sampler.content)
     if known is None:
-        sides, count = len(outside), min(count, len(outside))
-        return Opening(outside[[(best + sides * place // count) % sides for place in range(count)]], sampler.up, True)
+        sides = len(outside)
+        count = min(count, len(outside))
+        return Opening(
+            outside[[(best + sides * place // count) % sides for place in range(count)]],
+            sampler.up,
+            True,
+        )
     taken = sampler.completing(likelihoods, shown & ~whole_shown[best], count - 1)
-    viewmats = torch.cat([outside.viewmats[best : best + 1], known.viewmats[taken].to(outside.viewmats)])
+    viewmats = torch.cat(
+        [outside.viewmats[best : best + 1], known.viewmats[taken].to(outside.viewmats)]
+    )
     Ks = torch.cat([outside.Ks[best : best + 1], known.Ks[taken].to(outside.Ks)])
     return Opening(replace(known, viewmats=viewmats, Ks=Ks), sampler.up, True)

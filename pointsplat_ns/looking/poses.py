@@ -19,8 +19,8 @@ def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Ten
     Args:
         positions: (C, 3) of the cameras.
         targets: (C, 3); where a target is at its camera's position, the camera looks along x.
-        up: (3,) direction that is up in the pictures, of any length; by default z. Cameras that look along it have
-            another direction up.
+        up: (3,) direction that is up in the pictures, of any length; by default z. Cameras that
+            look along it have another direction up.
 
     Returns:
         (C, 4, 4), OpenCV axes.
@@ -29,7 +29,11 @@ def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Ten
     length = forward.norm(dim=1, keepdim=True)
     ahead = forward.new_tensor([1.0, 0.0, 0.0]).expand_as(forward)
     forward = torch.where(length > 0, forward / length.clamp_min(1e-300), ahead)
-    up = forward.new_tensor([0.0, 0.0, 1.0]) if up is None else up.to(forward) / up.to(forward).norm()
+    up = (
+        forward.new_tensor([0.0, 0.0, 1.0])
+        if up is None
+        else up.to(forward) / up.to(forward).norm()
+    )
     other = torch.eye(3, dtype=forward.dtype, device="cpu")[int(up.abs().argmin())]
     steep = (forward @ up).abs() > 0.99
     right = torch.linalg.cross(forward, torch.where(steep[:, None], other, up))
@@ -48,7 +52,8 @@ def views_of(viewmats: Tensor, width: int, height: int, diagonal: float) -> View
     Args:
         viewmats: (C, 4, 4).
         width, height: size of the pictures, pixels.
-        diagonal: of the content, in the unit of ``viewmats``; the near plane is a thousandth of it away.
+        diagonal: of the content, in the unit of ``viewmats``; the near plane is a thousandth of it
+            away.
     """
     focal = 0.5 * max(width, height) / math.tan(math.radians(LOOKING.field_of_view) / 2)
     K = viewmats.new_tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
@@ -63,7 +68,9 @@ def level_directions(up: Tensor, turn: Tensor) -> Tensor:
     return turn.cos()[:, None] * right + turn.sin()[:, None] * torch.linalg.cross(up, right)
 
 
-def whole_views(points: Tensor, up: Tensor, turns: Tensor, elevation: float, width: int, height: int) -> Views:
+def whole_views(
+    points: Tensor, up: Tensor, turns: Tensor, elevation: float, width: int, height: int
+) -> Views:
     """Views from around the content, each as near as the whole of it allows; float64, units.
 
     Args:
@@ -73,7 +80,9 @@ def whole_views(points: Tensor, up: Tensor, turns: Tensor, elevation: float, wid
         elevation: of the cameras above the content, degrees.
         width, height: size of the pictures, pixels.
     """
-    level = torch.stack([*level_directions(up, up.new_tensor([0.0, math.pi / 2])), up])  # [3, 3] rows
+    level = torch.stack(
+        [*level_directions(up, up.new_tensor([0.0, math.pi / 2])), up]
+    )  # [3, 3] rows
     quantiles = points.new_tensor([0.005, 0.995])  # what lies beyond is no part of the subject
     middle = (points @ level.T).quantile(quantiles, dim=0).mean(0) @ level
     lift = math.radians(elevation)
@@ -81,8 +90,12 @@ def whole_views(points: Tensor, up: Tensor, turns: Tensor, elevation: float, wid
     viewmats = look_at(sides, torch.zeros_like(sides), up)
     x, y, z = (viewmats[:, :3, :3] @ (points - middle).T).unbind(1)  # [n, M]
     reach = math.tan(math.radians(LOOKING.field_of_view) / 2) / max(width, height)
-    across, along = 0.92, 0.88  # largest shares of the picture's width and height that the subject takes
-    needed = torch.maximum(x.abs() / (across * width * reach), y.abs() / (along * height * reach)) - z
+    # largest shares of the picture's width and height that the subject takes
+    across = 0.92
+    along = 0.88
+    needed = (
+        torch.maximum(x.abs() / (across * width * reach), y.abs() / (along * height * reach)) - z
+    )
     distances = needed.quantile(quantiles[1], dim=1).clamp_min(0.1)
     viewmats = look_at(middle + distances[:, None] * sides, middle.expand_as(sides), up)
     return views_of(viewmats, width, height, UNITS)

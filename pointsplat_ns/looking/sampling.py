@@ -1,19 +1,20 @@
 """Samples views of a scene that comes without cameras: such as people may have taken photos from.
 
-Training spends Gaussians on what photos show, makes them as small as photos show them, and leaves nothing to see where
-no photo looked. So a view is likely if its picture is full and shows many Gaussians, all of them small. SH tell more:
-they explain best the places that photos were taken from (:mod:`~pointsplat_ns.looking.traces`). The logarithm of the
-likelihood, up to a constant, is
+Training spends Gaussians on what photos show, makes them as small as photos show them, and leaves
+nothing to see where no photo looked. So a view is likely if its picture is full and shows many
+Gaussians, all of them small. SH tell more: they explain best the places that photos were taken from
+(:mod:`~pointsplat_ns.looking.traces`). The logarithm of the likelihood, up to a constant, is
 
     log(shown) - log(empty + 0.01) - 2 log(blur) + 0.75 evidence - (pitch + 15)^2 / (2 25^2)
 
-with the share of the Gaussians that are shown, the share of the picture that is empty, the mean over the picture of
-the angle that a Gaussian subtends, radians, the evidence of SH for its place, and its pitch, degrees: few photos look
-far up or down. A logistic regression between the poses of six captures and candidates gives 1.2, 1.3 and 0.75 without
-blur and pitch: with each capture left out in turn, a pose of it is likelier than a candidate in 89 % of cases. Blur
-tells poses from candidates no better; views from within walls, which captures lack, need it. Candidates whose pitch
-is bound to -50 to 10 degrees instead lose 0.2 dB on average over the six at 10 %, most where the estimated up is
-wrong. ``docs/concepts/sampled_views.md`` says more.
+with the share of the Gaussians that are shown, the share of the picture that is empty, the mean
+over the picture of the angle that a Gaussian subtends, radians, the evidence of SH for its place,
+and its pitch, degrees: few photos look far up or down. A logistic regression between the poses of
+six captures and candidates gives 1.2, 1.3 and 0.75 without blur and pitch: with each capture left
+out in turn, a pose of it is likelier than a candidate in 89 % of cases. Blur tells poses from
+candidates no better; views from within walls, which captures lack, need it. Candidates whose pitch
+is bound to -50 to 10 degrees instead lose 0.2 dB on average over the six at 10 %, most where the
+estimated up is wrong. ``docs/concepts/sampled_views.md`` says more.
 """
 
 from __future__ import annotations
@@ -30,7 +31,14 @@ from pointsplat_ns.comparing.sizes import RESOLUTION
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import curve_keys, invert_rigid, unit_cells
-from pointsplat_ns.looking.content import UNITS, content_size, in_scene_units, in_units, thinned, thinning
+from pointsplat_ns.looking.content import (
+    UNITS,
+    content_size,
+    in_scene_units,
+    in_units,
+    thinned,
+    thinning,
+)
 from pointsplat_ns.looking.poses import level_directions, look_at, views_of
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoTraces, log_widths, means_around
@@ -52,9 +60,10 @@ def sample_views(
 ) -> Views:
     """Sample cameras that look at a scene as people may have when they took its photos.
 
-    Candidates look at Gaussians at random, from distances at which these are small, or from places where SH suggest
-    that photos were taken. Of the likely ones (:mod:`pointsplat_ns.looking.sampling`), the next view is always the
-    one that shows most of what earlier views do not show. Views complete each other, so ask for all of them at once.
+    Candidates look at Gaussians at random, from distances at which these are small, or from places
+    where SH suggest that photos were taken. Of the likely ones
+    (:mod:`pointsplat_ns.looking.sampling`), the next view is always the one that shows most of what
+    earlier views do not show. Views complete each other, so ask for all of them at once.
 
     Args:
         scene: N Gaussians.
@@ -62,16 +71,17 @@ def sample_views(
         width: of the images, pixels.
         height: of the images, pixels. The field of view is 70 degrees across the longer side.
         seed: the same scene and seed give the same views, another seed gives others.
-        up: (3,) direction that is up in the world, of any length; by default the scene's own, or estimated
-            (:mod:`pointsplat_ns.looking.upright`).
+        up: (3,) direction that is up in the world, of any length; by default the scene's own, or
+            estimated (:mod:`pointsplat_ns.looking.upright`).
 
     Returns:
-        ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in OpenCV axes and
-        ``Ks`` (count, 3, 3) in pixels, float64, with a near plane that suits the scene's size.
+        ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in
+        OpenCV axes and ``Ks`` (count, 3, 3) in pixels, float64, with a near plane that suits the
+        scene's size.
 
     Raises:
-        DataError: if ``count`` or the size is not positive, ``up`` is not a direction, or nothing of the scene is
-            visible.
+        DataError: if ``count`` or the size is not positive, ``up`` is not a direction, or nothing
+            of the scene is visible.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -84,20 +94,25 @@ def sample_views(
         up = torch.as_tensor(up, **DOUBLES).detach()
         if up.shape != (3,) or not 0 < float(up.norm()) < math.inf:
             raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
-    return Sampler(scene, (width, height), None if up is None else Up(up / up.norm())).views(count, seed)
+    return Sampler(scene, (width, height), None if up is None else Up(up / up.norm())).views(
+        count, seed
+    )
 
 
 class Sampler:
-    """Samples views of a scene as :func:`sample_views` does. What all views have in common is found once.
+    """Samples views of a scene as :func:`sample_views` does. What all views have in common is found
+    once.
 
     Args:
         scene: N Gaussians. A large one is thinned.
         resolution: width and height of the views, pixels.
         up: which way is up; by default the axis that the scene declares, or estimated.
-        stands_for: number of Gaussians of a larger scene for each, which was enlarged by that (:func:`enlarged`).
+        stands_for: number of Gaussians of a larger scene for each, which was enlarged by that
+            (:func:`enlarged`).
 
     Raises:
-        DataError: if the resolution is not positive; and by attributes and methods, if nothing of the scene is visible.
+        DataError: if the resolution is not positive; and by attributes and methods, if nothing of
+            the scene is visible.
     """
 
     def __init__(
@@ -108,10 +123,16 @@ class Sampler:
         stands_for: float = 1.0,
     ):
         if min(resolution) < 1:
-            raise DataError(f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least 1 x 1")
-        self.scene = thinned(scene.detach(), LOOKING.sampled_count).to("cpu")  # many small operations
+            raise DataError(
+                f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least "
+                "1 x 1"
+            )
+        self.scene = thinned(scene.detach(), LOOKING.sampled_count).to(
+            "cpu"
+        )  # many small operations
         self._step = stands_for * thinning(len(scene), LOOKING.sampled_count)
-        self.resolution, self._up = resolution, known_up(up, scene)
+        self.resolution = resolution
+        self._up = known_up(up, scene)
 
     @cached_property
     def content(self) -> tuple[Tensor, float]:
@@ -144,7 +165,9 @@ class Sampler:
     @cached_property
     def up(self) -> Up:
         """Which way is up."""
-        few = thinned(self._in_units, 20_000)  # with half as many, a published room stands on its head
+        few = thinned(
+            self._in_units, 20_000
+        )  # with half as many, a published room stands on its head
         return self._up or upright(few, self.surface, self._traces.sure)
 
     @cached_property
@@ -177,20 +200,27 @@ class Sampler:
 
     @torch.no_grad()
     def views(self, count: int, seed: int = 0, likeliest: bool = False) -> Views:
-        """``count`` views on the CPU. ``count``, ``seed`` and errors are those of :func:`sample_views`. Views complete
-        each other, or are the likeliest, which may show the same."""
+        """``count`` views on the CPU. ``count``, ``seed`` and errors are those of
+        :func:`sample_views`. Views complete each other, or are the likeliest, which may show the
+        same."""
         if count < 1:
             raise DataError(f"{count} views asked for; expected at least 1")
         generator = torch.Generator().manual_seed(seed)
-        drawn = self._drawn(max(LOOKING.min_candidates, LOOKING.candidates_per_view * count), generator)
+        drawn = self._drawn(
+            max(LOOKING.min_candidates, LOOKING.candidates_per_view * count), generator
+        )
         candidates = views_of(drawn, *self.resolution, UNITS)
         likelihoods, shown = self.judged(candidates)
-        taken = likelihoods.topk(count).indices.tolist() if likeliest else self.completing(likelihoods, shown, count)
+        taken = (
+            likelihoods.topk(count).indices.tolist()
+            if likeliest
+            else self.completing(likelihoods, shown, count)
+        )
         return in_scene_units(candidates[taken], *self.content)
 
     def judged(self, views: Views) -> tuple[Tensor, Tensor]:
-        """Logarithms (V,) of the likelihood of views in units of the content, up to a constant, float64, and which of
-        the Gaussians :attr:`few` each shows (V, n), bool."""
+        """Logarithms (V,) of the likelihood of views in units of the content, up to a constant,
+        float64, and which of the Gaussians :attr:`few` each shows (V, n), bool."""
         viewmats = views.viewmats.double()
         eyes = invert_rigid(viewmats)[:, :3, 3]
         small = replace(views.resized(LOOKING.candidate_side), rasterize_mode="antialiased")
@@ -210,14 +240,16 @@ class Sampler:
 
         likelihoods, shown = zip(*in_turn(look, range(len(small)), self.few.device), strict=True)
         traces = self._traces
-        evidence = traces.evidence(eyes).double() if traces.has_sh else torch.zeros(len(eyes), **DOUBLES)
+        evidence = (
+            traces.evidence(eyes).double() if traces.has_sh else torch.zeros(len(eyes), **DOUBLES)
+        )
         pitch = torch.rad2deg(torch.asin((viewmats[:, 2, :3] @ self.up.direction).clamp(-1, 1)))
         usual = -0.5 * ((pitch + 15) / 25).square()
         return torch.tensor(likelihoods, **DOUBLES) + 0.75 * evidence + usual, torch.stack(shown)
 
     def completing(self, likelihoods: Tensor, shown: Tensor, count: int) -> list[int]:
-        """Indices of at most ``count`` views, as :meth:`judged`. The next one always has the largest product of its
-        likelihood and of what it adds to those before."""
+        """Indices of at most ``count`` views, as :meth:`judged`. The next one always has the
+        largest product of its likelihood and of what it adds to those before."""
         likely = (likelihoods - likelihoods.max()).exp().float()
         shown = shown[:, self._targets].float()
         coverage = torch.zeros_like(shown[0])
@@ -230,30 +262,41 @@ class Sampler:
         return taken
 
     def _drawn(self, count: int, generator: torch.Generator) -> Tensor:
-        """Candidates (count, 4, 4): half of them at random distances from Gaussians, half from likely photo places."""
+        """Candidates (count, 4, 4): half of them at random distances from Gaussians, half from
+        likely photo places."""
         half = count // 2 if len(self._traces.places) else 0
         at_gaussians = self._at_gaussians(count - half, generator)
-        return torch.cat([at_gaussians, self._from_places(half, generator)]) if half else at_gaussians
+        return (
+            torch.cat([at_gaussians, self._from_places(half, generator)]) if half else at_gaussians
+        )
 
     def _at_gaussians(self, count: int, generator: torch.Generator) -> Tensor:
-        """Cameras (count, 4, 4) that look at Gaussians at any pitch, from where their neighbourhood is as small as in
-        photos, or, if that is too far away, from any distance."""
-        up, aim = self.up.direction, self._some_targets(count, generator)
+        """Cameras (count, 4, 4) that look at Gaussians at any pitch, from where their neighbourhood
+        is as small as in photos, or, if that is too far away, from any distance."""
+        up = self.up.direction
+        aim = self._some_targets(count, generator)
         angle, turn, pitch = torch.rand(3, count, generator=generator, **DOUBLES)
         small, large = LOOKING.apparent_sizes
         distance = means_around(self._log_widths, 9)[aim].exp() / (small * (large / small) ** angle)
         distance = torch.where(distance < UNITS, distance, UNITS * angle).clamp_min(0.01 * UNITS)
         pitch = math.pi * (pitch - 0.5)
-        ahead = pitch.cos()[:, None] * level_directions(up, 2 * math.pi * turn) + pitch.sin()[:, None] * up
+        ahead = (
+            pitch.cos()[:, None] * level_directions(up, 2 * math.pi * turn)
+            + pitch.sin()[:, None] * up
+        )
         target = self.few.means[aim].double()
         below = ((target - distance[:, None] * ahead) @ up < self._floor).to(ahead.dtype)
         ahead = ahead - (2 * below * (ahead @ up))[:, None] * up  # from above instead
         return look_at(target - distance[:, None] * ahead, target, up)
 
     def _from_places(self, count: int, generator: torch.Generator) -> Tensor:
-        """Cameras (count, 4, 4) near photo places, which are drawn by their shares, each looking at a Gaussian."""
-        up, traces = self.up.direction, self._traces
-        drawn = torch.multinomial(traces.shares.float(), count, replacement=True, generator=generator)
+        """Cameras (count, 4, 4) near photo places, which are drawn by their shares, each looking at
+        a Gaussian."""
+        up = self.up.direction
+        traces = self._traces
+        drawn = torch.multinomial(
+            traces.shares.float(), count, replacement=True, generator=generator
+        )
         offsets = torch.randn(count, 3, generator=generator, **DOUBLES)
         eyes = traces.places[drawn] + LOOKING.photo_place_deviation * offsets
         eyes = eyes + (self._floor - eyes @ up).clamp_min(0)[:, None] * up
@@ -261,4 +304,6 @@ class Sampler:
 
     def _some_targets(self, count: int, generator: torch.Generator) -> Tensor:
         """Indices (count,) of Gaussians to look at, each as likely as any other."""
-        return self._targets[torch.randint(len(self._targets), (count,), generator=generator, device="cpu")]
+        return self._targets[
+            torch.randint(len(self._targets), (count,), generator=generator, device="cpu")
+        ]

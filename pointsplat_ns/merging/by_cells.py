@@ -1,14 +1,17 @@
 """Merging of scenes that are larger than memory: cell by cell, with files in between.
 
-1. Parts of the curve with equally many Gaussians are the **cells**; each gets a file of its own (``cells.py``).
-2. Thinned scenes give views, visibility weights and axes of colours: the overview. Views and weights are those of
+1. Parts of the curve with equally many Gaussians are the **cells**; each gets a file of its own
+  (``cells.py``).
+2. Thinned scenes give views, visibility weights and axes of colours: the overview. Views and
+  weights are those of
    merging in memory.
-3. A round finds pairs in each cell. The cheapest of all cells are merged: one price holds everywhere, and the count is
+3. A round finds pairs in each cell. The cheapest of all cells are merged: one price holds
+  everywhere, and the count is
    exact.
 4. In each cell, members are regrouped, and their rows are written.
 
-What a step has written is kept, and a command that was killed resumes from there. Several processes may share the
-cells.
+What a step has written is kept, and a command that was killed resumes from there. Several processes
+may share the cells.
 """
 
 from __future__ import annotations
@@ -70,7 +73,8 @@ def merge_file(
         most: largest number of Gaussians in a cell, about.
         scratch: where finished steps are kept.
         views: from every so many-th Gaussian to known views, or None for sampled ones.
-        sampler: from Gaussians of the scene, and how many each ``stands_for``, to the sampler of their views.
+        sampler: from Gaussians of the scene, and how many each ``stands_for``, to the sampler of
+            their views.
         progress: called with what is being done, and the share done of it.
         settings: the tuned numbers.
         jobs: number of processes that share the cells. The result is the same to the bit.
@@ -80,14 +84,16 @@ def merge_file(
 
     Raises:
         SceneError: if a file cannot be read or written, or no Gaussian can be drawn.
-        BudgetError: that ``count_of`` raises, or if there are more cells than Gaussians that remain.
+        BudgetError: that ``count_of`` raises, or if there are more cells than Gaussians that
+            remain.
         PointSplatError: if processes are killed.
     """
     cells = divided(rows, most, scratch, functools.partial(progress, "dividing into cells"))
     k = count_of(cells.count)
     if k < len(cells):
         raise BudgetError(
-            f"cannot merge {len(cells)} parts of a scene into {k} Gaussians; expected {len(cells)} or more"
+            f"cannot merge {len(cells)} parts of a scene into {k} Gaussians; expected "
+            f"{len(cells)} or more"
         )
 
     def look() -> dict[str, Tensor]:
@@ -96,7 +102,9 @@ def merge_file(
         step = thinning(rows.count, LOOKING.sampled_count)
         some = enlarged(rows.pick(range(0, rows.count, step)), step)  # they cover as much as all
         with one_thread_each():
-            seen = views_to_weigh(cells.starts(k)[-1], views(some) or sampler(some, stands_for=step), settings)
+            seen = views_to_weigh(
+                cells.starts(k)[-1], views(some) or sampler(some, stands_for=step), settings
+            )
             return vars(overview_of(cells, k, *seen, settings, report))
 
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
@@ -105,18 +113,26 @@ def merge_file(
         def each(what: str, *step: float) -> None:
             """Every cell takes a step."""
             progress(what, 0.0)
-            for done, _ in enumerate(workers.results([(cell, *step) for cell in range(len(cells))]), 1):
+            for done, _ in enumerate(
+                workers.results([(cell, *step) for cell in range(len(cells))]), 1
+            ):
                 progress(what, done / len(cells))
 
-        rounds, left = 0, -1
+        rounds = 0
+        left = -1
         while left != k:
             if not scratch.has(_chosen(rounds)):
                 each(f"merging, round {rounds + 1}", rounds)
-            left = int(scratch.tensors(_chosen(rounds), functools.partial(work.choose, rounds))["left"])
+            left = int(
+                scratch.tensors(_chosen(rounds), functools.partial(work.choose, rounds))["left"]
+            )
             rounds += 1
         changes = torch.cat([scratch.known(_sizes(cell))["changes"] for cell in range(len(cells))])
         each("finishing", rounds, float(changes.mean()))
-    with replacing(output, ply_bytes(k, rows.sh_degree, rows.traits)) as part, part.open("wb") as stream:
+    with (
+        replacing(output, ply_bytes(k, rows.sh_degree, rows.traits)) as part,
+        part.open("wb") as stream,
+    ):
         stream.write(header_bytes(k, rows.sh_degree, rows.traits))
         for cell in range(len(cells)):
             with _finished(scratch, cell).open("rb") as finished:
@@ -130,21 +146,28 @@ class Overview:
 
     centre: Tensor  # [3] float64, of the content
     size: Tensor  # scalar float64, diagonal of the content, scene units
-    weights: Tensor  # [m] float32, visibility weights of every ``step``-th member of all cells, along the curve
+    # [m] float32, visibility weights of every ``step``-th member of all cells, along the curve
+    weights: Tensor
     step: Tensor  # scalar int64
     middle: Tensor  # [3 (d+1)^2] as of principal_axes
     axes: Tensor  # [3 (d+1)^2, C]
 
 
 def overview_of(
-    cells: Cells, k: int, views: Views | None, traced: bool, settings: MergeSettings, report: Callable[[float], None]
+    cells: Cells,
+    k: int,
+    views: Views | None,
+    traced: bool,
+    settings: MergeSettings,
+    report: Callable[[float], None],
 ) -> Overview:
-    """The overview of cells that become ``k`` Gaussians, with views of :func:`views_to_weigh`, and whether trace
-    factors count. Every so many-th member of all is drawn: a sample of the file would have holes, through which what is
-    hidden shows."""
+    """The overview of cells that become ``k`` Gaussians, with views of :func:`views_to_weigh`, and
+    whether trace factors count. Every so many-th member of all is drawn: a sample of the file would
+    have holes, through which what is hidden shows."""
     *starts, count = cells.starts(k)
     step = drawn_step(count, settings)
-    parts, traces = [], []
+    parts = []
+    traces = []
     for cell, start in enumerate(starts):
         scene, members = cells.members(cell, k)
         here = slice(-start % step, None, step)
@@ -154,16 +177,22 @@ def overview_of(
         report(0.5 * len(parts) / len(cells))
     scene = enlarged(Gaussians.cat(parts), step)
     participants = Participants(scene, torch.arange(len(scene), **INDICES), *content_size(scene))
-    weights = visibility_weights(participants, views, settings, lambda share: report(0.5 + 0.5 * share))
+    weights = visibility_weights(
+        participants, views, settings, lambda share: report(0.5 + 0.5 * share)
+    )
     if traced:
         weights *= factors_of(*torch.cat(traces, dim=1))
-    size, every = torch.tensor(participants.size, **DOUBLES), torch.tensor(step, **INDICES)
-    return Overview(participants.centre, size, weights, every, *principal_axes(scene, participants.members))
+    size = torch.tensor(participants.size, **DOUBLES)
+    every = torch.tensor(step, **INDICES)
+    return Overview(
+        participants.centre, size, weights, every, *principal_axes(scene, participants.members)
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """The steps of cells. Called with a cell, the number of rounds before, and to finish it the change of sizes."""
+    """The steps of cells. Called with a cell, the number of rounds before, and to finish it the
+    change of sizes."""
 
     cells: Cells
     overview: Overview
@@ -182,8 +211,8 @@ class _Work:
                 self.write(rounds, cell, size_change[0], part)
 
     def pairs(self, number: int, cell: int) -> dict[str, Tensor]:
-        """The state of a cell after ``number`` rounds, the ``group`` (n,) of each participant in it, and the pairs that
-        may be merged next."""
+        """The state of a cell after ``number`` rounds, the ``group`` (n,) of each participant in
+        it, and the pairs that may be merged next."""
         with one_thread_each():
             state, group = self.state(number, cell)
             near = other_neighbours(state.means.double(), self.settings.neighbours)
@@ -193,20 +222,26 @@ class _Work:
         return {**vars(state), "group": group.int(), **pairs}
 
     def choose(self, number: int) -> dict[str, Tensor]:
-        """Which pairs of each cell, (E,) bool by its number, are the cheapest of all, and how many Gaussians are
-        ``left`` then."""
-        left, prices = 0, []
+        """Which pairs of each cell, (E,) bool by its number, are the cheapest of all, and how many
+        Gaussians are ``left`` then."""
+        left = 0
+        prices = []
         for cell in range(len(self.cells)):
             found = self.cells.scratch.known(_round(number, cell))
             left += len(found["means"])
             prices.append(found["prices"])
         chosen = lowest(prices, min(left - self.k, most_pairs(left, self.settings)))
         merged = sum(int(part.sum()) for part in chosen)
-        return {**{f"{cell}": part for cell, part in enumerate(chosen)}, "left": torch.tensor(left - merged, **INDICES)}
+        return {
+            **{f"{cell}": part for cell, part in enumerate(chosen)},
+            "left": torch.tensor(left - merged, **INDICES),
+        }
 
     def state(self, number: int, cell: int) -> tuple[State, Tensor]:
-        """The state of a cell after ``number`` rounds, and the group (n,) of each participant in it."""
-        scratch, overview = self.cells.scratch, self.overview
+        """The state of a cell after ``number`` rounds, and the group (n,) of each participant in
+        it."""
+        scratch = self.cells.scratch
+        overview = self.overview
         if number == 0:
             participants = self.participants(cell)
             scratch.make(_sizes(cell), functools.partial(self.size_changes, cell, participants))
@@ -223,22 +258,29 @@ class _Work:
 
     def participants(self, cell: int) -> Participants:
         """The participants of a cell, along the curve."""
-        return Participants(*self.cells.members(cell, self.k), self.overview.centre, float(self.overview.size))
+        return Participants(
+            *self.cells.members(cell, self.k), self.overview.centre, float(self.overview.size)
+        )
 
     def size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
-        """The finish of the parts in this cell, of four parts that are evenly spread over all cells.
+        """The finish of the parts in this cell, of four parts that are evenly spread over all
+        cells.
 
-        In five scenes, an eighth of a scene at a time, their mean factor differs from that of the whole by 0.02 at
-        most. A thinned scene needs smaller factors than the whole.
+        In five scenes, an eighth of a scene at a time, their mean factor differs from that of the
+        whole by 0.02 at most. A thinned scene needs smaller factors than the whole.
         """
-        changes, parts, size = [], 4, 1 << 18
+        changes = []
+        parts = 4
+        size = 1 << 18
         for number in range(parts):
             found, place = divmod((number + 0.5) * len(self.cells) / parts, 1)
             if found == cell:
                 start = max(0, int(place * len(participants)) - size // 2)
                 part = participants.scene[participants.members[start : start + size]]
                 few = max(1, len(part) * self.k // self.cells.count)
-                changes.append(merge(part, few, views=self.sampler(part), settings=self.settings).size_change)
+                changes.append(
+                    merge(part, few, views=self.sampler(part), settings=self.settings).size_change
+                )
         return {"changes": torch.tensor(changes, **FLOATS)}
 
     def write(self, rounds: int, cell: int, size_change: float, path: Path) -> None:
@@ -246,7 +288,9 @@ class _Work:
         with one_thread_each():
             state, group = self.state(rounds, cell)
             participants = self.participants(cell)
-            groups = Groups.of(participants, state, [Round(group, torch.ones(len(group), **FLOATS))])
+            groups = Groups.of(
+                participants, state, [Round(group, torch.ones(len(group), **FLOATS))]
+            )
             del state
             if groups.any_merged:
                 groups = regrouped(participants, groups, self.settings)
@@ -254,11 +298,13 @@ class _Work:
 
 
 def lowest(parts: list[Tensor], most: int) -> list[Tensor]:
-    """Which numbers of some parts, float32 and not below 0, are the ``most`` lowest of all, bool as the parts; of equal
-    ones the first. They are counted by the upper half of their bits, then by the lower one, which are in the order of
-    the numbers: sorting all together would take five times their memory."""
+    """Which numbers of some parts, float32 and not below 0, are the ``most`` lowest of all, bool as
+    the parts; of equal ones the first. They are counted by the upper half of their bits, then by
+    the lower one, which are in the order of the numbers: sorting all together would take five times
+    their memory."""
     bits = [part.view(torch.int32) for part in parts]
-    limit, rest = 0, most
+    limit = 0
+    rest = most
     for shift, values in ((16, 1 << 15), (0, 1 << 16)):
         counts = torch.zeros(values, **INDICES)
         for part in bits:

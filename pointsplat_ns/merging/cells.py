@@ -1,4 +1,5 @@
-"""A scene that is larger than memory, in cells: parts of a space-filling curve with equally many Gaussians.
+"""A scene that is larger than memory, in cells: parts of a space-filling curve with equally many
+Gaussians.
 
 Each cell has a file of its own, in a folder of finished steps.
 """
@@ -20,7 +21,14 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import Cube, bulk_cube, curve_keys, unit_cells
-from pointsplat_ns.io.files import logger, one_line, read_text, require_space, write_json, write_tensors
+from pointsplat_ns.io.files import (
+    logger,
+    one_line,
+    read_text,
+    require_space,
+    write_json,
+    write_tensors,
+)
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.merging.state import drawable, sampled_step
@@ -55,7 +63,9 @@ class Scratch:
                 shutil.rmtree(folder)
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise SceneError(f"{folder}: cannot be used ({error.strerror or one_line(error)})") from error
+            raise SceneError(
+                f"{folder}: cannot be used ({error.strerror or one_line(error)})"
+            ) from error
         if not same:
             require_space(folder, folder, size)
             write_json(work, known)
@@ -75,14 +85,17 @@ class Scratch:
         return self.known(name)
 
     def known(self, name: str) -> dict[str, Tensor]:
-        """The tensors of a step that was taken. Raises SceneError if its file is gone or damaged."""
+        """The tensors of a step that was taken. Raises SceneError if its file is gone or
+        damaged."""
         from safetensors import SafetensorError
         from safetensors.torch import load_file
 
         try:
             return load_file(self._path(name))
         except (OSError, SafetensorError) as error:
-            raise SceneError(f"{self.folder}: damaged ({one_line(error)}); remove it and start again") from error
+            raise SceneError(
+                f"{self.folder}: damaged ({one_line(error)}); remove it and start again"
+            ) from error
 
     def drop(self, name: str) -> None:
         """Remove the tensors of a step, if they are there."""
@@ -129,16 +142,21 @@ class Cells:
                 if len(table) < count * sum(widths):
                     raise SceneError(f"{path}: truncated; remove the folder and start again")
                 columns = torch.from_numpy(table.reshape(count, -1).astype(np.float32, copy=False))
-                for (_, into), values in zip(scene.items(), columns.split(widths, dim=1), strict=True):
+                for (_, into), values in zip(
+                    scene.items(), columns.split(widths, dim=1), strict=True
+                ):
                     into[start : start + count] = values.reshape(count, *into.shape[1:])
         return scene
 
     def members(self, cell: int, k: int) -> tuple[Gaussians, Tensor]:
-        """The Gaussians of a cell, and the indices (n,) of those that are merged where all together become ``k``, along
-        the curve."""
+        """The Gaussians of a cell, and the indices (n,) of those that are merged where all together
+        become ``k``, along the curve."""
         scene = self.read(cell)
         members = drawable(scene, self.share(cell, k))
-        keys = [curve_keys(unit_cells(scene.means[some], self.cube)) for some in members.split(ROWS_AT_ONCE)]
+        keys = [
+            curve_keys(unit_cells(scene.means[some], self.cube))
+            for some in members.split(ROWS_AT_ONCE)
+        ]
         return scene, members[torch.cat(keys).argsort(stable=True)]
 
     def starts(self, k: int) -> list[int]:
@@ -168,7 +186,8 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
     usable = some.usable()
     if not bool(usable.any()):
         raise SceneError(
-            f"{rows.path}: none of {len(some)} Gaussians in it can be drawn: all have NaN or infinite values"
+            f"{rows.path}: none of {len(some)} Gaussians in it can be drawn: all have NaN or "
+            "infinite values"
         )
     numbers = torch.tensor(picked, **INDICES)[usable]
     some = usable_part(some)
@@ -181,7 +200,10 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
     def write() -> dict[str, Tensor]:
         counts, clear = torch.zeros(2, cells, **INDICES)
         with ExitStack() as stack:
-            files = [stack.enter_context((scratch.folder / _name(cell)).open("wb")) for cell in range(cells)]
+            files = [
+                stack.enter_context((scratch.folder / _name(cell)).open("wb"))
+                for cell in range(cells)
+            ]
             for start in range(0, rows.count, ROWS_AT_ONCE):
                 piece = rows.read(start, min(start + ROWS_AT_ONCE, rows.count))
                 numbers = torch.arange(start, start + len(piece), **INDICES)[piece.usable()]
@@ -198,18 +220,26 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
                 report(min(1.0, (start + ROWS_AT_ONCE) / rows.count))
         dropped = rows.count - int(counts.sum())
         if dropped:
-            logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", rows.path, dropped, rows.count)
+            logger.warning(
+                "%s: dropped %d of %d Gaussians with NaN or infinite values",
+                rows.path,
+                dropped,
+                rows.count,
+            )
         return {"counts": counts, "drawable": clear}
 
     counts = scratch.tensors("counts", write)
     return Cells(
-        scratch, some[:0].map(torch.clone), cube, *(tuple(counts[name].tolist()) for name in ("counts", "drawable"))
+        scratch,
+        some[:0].map(torch.clone),
+        cube,
+        *(tuple(counts[name].tolist()) for name in ("counts", "drawable")),
     )
 
 
 def _places(keys: Tensor, numbers: Tensor, count: int) -> Tensor:
-    """Places (n,) int64 on the curve, from keys on the curve and the numbers of ``count`` rows. The last 21 bits hold
-    the order in the file, so that Gaussians at one position can be parted too."""
+    """Places (n,) int64 on the curve, from keys on the curve and the numbers of ``count`` rows. The
+    last 21 bits hold the order in the file, so that Gaussians at one position can be parted too."""
     return ((keys >> 18) << 21) | (numbers * (1 << 21) // count)
 
 

@@ -1,7 +1,9 @@
-"""The groups of Gaussians that were merged, the scene of one Gaussian for each group, and one factor for their sizes.
+"""The groups of Gaussians that were merged, the scene of one Gaussian for each group, and one
+factor for their sizes.
 
-How large a merged Gaussian must be to look like its members depends on how these overlap and on what is behind them,
-and differs between scenes. The factor is chosen by the PSNR against renders of the dense scene.
+How large a merged Gaussian must be to look like its members depends on how these overlap and on
+what is behind them, and differs between scenes. The factor is chosen by the PSNR against renders of
+the dense scene.
 """
 
 from __future__ import annotations
@@ -38,9 +40,11 @@ class Groups:
     @classmethod
     def of(cls, participants: Participants, state: State, rounds: Sequence[Round]) -> Groups:
         """The groups that became the Gaussians of a state after some rounds."""
-        group, shares = numbers(len(state), state.means.device), torch.ones_like(state.weights)
+        group = numbers(len(state), state.means.device)
+        shares = torch.ones_like(state.weights)
         for place, share in reversed(rounds):
-            group, shares = group[place], shares[place] * share
+            group = group[place]
+            shares = shares[place] * share
         means = state.means.double() * participants.size + participants.centre.to(group.device)
         cov = state.cov.double() * participants.size**2
         return cls(group, shares, means, cov, state.alphas.double(), state.counts)
@@ -54,32 +58,40 @@ class Groups:
 def scene_maker(
     participants: Participants, groups: Groups, settings: MergeSettings
 ) -> tuple[Tensor, Callable[[float], Gaussians]]:
-    """The scene of K groups, in the order of their first members. A group of one member is that member to the bit.
+    """The scene of K groups, in the order of their first members. A group of one member is that
+    member to the bit.
 
     Returns:
-        The group (n,) of each participant, and a function from a size change, which is added to the log-scales of
-        merged Gaussians, to the scene.
+        The group (n,) of each participant, and a function from a size change, which is added to the
+        log-scales of merged Gaussians, to the scene.
     """
-    first = groups.group.new_full((len(groups.counts),), len(participants.scene))  # index in the scene of each
+    first = groups.group.new_full(
+        (len(groups.counts),), len(participants.scene)
+    )  # index in the scene of each
     first, order = first.scatter_reduce_(0, groups.group, participants.members, "amin").sort()
     rank = torch.empty_like(order)
     rank[order] = numbers(len(order), order.device)
-    group, shares = rank[groups.group], groups.shares
-    means, cov, alphas, members = (values[order] for values in (groups.means, groups.cov, groups.alphas, groups.counts))
+    group = rank[groups.group]
+    shares = groups.shares
+    means, cov, alphas, members = (
+        values[order] for values in (groups.means, groups.cov, groups.alphas, groups.counts)
+    )
     del groups
-    scene, counts = participants.scene, members.double()
+    scene = participants.scene
+    counts = members.double()
     single = (counts == 1)[:, None]
     log_scales, quats = _axes(cov, scene.dtype)
     del cov
     means = torch.where(single, scene.means[first], means.to(scene.dtype))
     quats = torch.where(single, scene.quats[first], quats)
 
-    # Merging spreads mass over a larger area, so that more of the background shows through. At 10 %, the exponent gains
-    # 0.4 dB in flowers, 0.6 in a bouquet and nothing in three other scenes.
+    # Merging spreads mass over a larger area, so that more of the background shows through. At 10
+    # %, the exponent gains 0.4 dB in flowers, 0.6 in a bouquet and nothing in three other scenes.
     alphas = deepened(alphas, counts, 0.15, settings.max_opacity)
     logits = torch.logit(alphas, 1e-7)[:, None].to(scene.dtype)
     sh = _mean_sh(participants, group, shares, single[:, 0])
-    own_scales, opacities = scene.scales[first], torch.where(single, scene.opacities[first], logits)
+    own_scales = scene.scales[first]
+    opacities = torch.where(single, scene.opacities[first], logits)
 
     def make(size_change: float) -> Gaussians:
         scales = torch.where(single, own_scales, (log_scales + size_change).to(scene.dtype))
@@ -89,15 +101,17 @@ def scene_maker(
 
 
 def deepened(alphas: Tensor, counts: Tensor, exponent: float, max_opacity: float) -> Tensor:
-    """Opacities (n,) of Gaussians of ``counts`` (n,) members: 1 - (1 - alpha)^(counts^exponent), their optical depth
-    times counts^exponent."""
+    """Opacities (n,) of Gaussians of ``counts`` (n,) members: 1 - (1 - alpha)^(counts^exponent),
+    their optical depth times counts^exponent."""
     depth = -torch.log1p(-alphas.clamp_max(max_opacity)) * counts.double() ** exponent
     return (-torch.expm1(-depth)).clamp_max(ALPHA_MAX)
 
 
-def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: Tensor) -> tuple[Tensor, Tensor]:
-    """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means over the members by their ``shares`` (n,) of their groups
-    (n,). Those of a group of one, ``single`` (K,), are its own to the bit."""
+def _mean_sh(
+    participants: Participants, group: Tensor, shares: Tensor, single: Tensor
+) -> tuple[Tensor, Tensor]:
+    """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means over the members by their ``shares``
+    (n,) of their groups (n,). Those of a group of one, ``single`` (K,), are its own to the bit."""
     scene = participants.scene
     wide = torch.promote_types(scene.dtype, torch.float32)
     means = []
@@ -105,11 +119,14 @@ def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: 
         mean = torch.zeros(len(single), *values.shape[1:], dtype=wide, device=values.device)
 
         def part(rows: slice, values: Tensor = values) -> tuple[Tensor, ...]:
-            own, of_single = values[participants.members[rows]].to(wide), single[group[rows]]
+            own = values[participants.members[rows]].to(wide)
+            of_single = single[group[rows]]
             shared = own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1))
             return group[rows], shared, group[rows][of_single], own[of_single]
 
-        for groups, shared, singles, own in in_turn(part, pieces(len(group), group.device), group.device):
+        for groups, shared, singles, own in in_turn(
+            part, pieces(len(group), group.device), group.device
+        ):
             add_rows(mean, groups, shared)
             mean[singles] = own
         means.append(mean.to(scene.dtype))
@@ -118,11 +135,17 @@ def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: 
 
 def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Log-scales (n, 3) float64, and quaternions (n, 4) of some dtype, of covariances (n, 6)."""
-    scales, quats = cov.new_empty(len(cov), 3), cov.new_empty(len(cov), 4, dtype=dtype)
+    scales = cov.new_empty(len(cov), 3)
+    quats = cov.new_empty(len(cov), 4, dtype=dtype)
 
     def fill(rows: slice) -> None:
         variances, axes = eigen(unpack(cov[rows]))
-        axes[:, :, 0] *= torch.linalg.cross(axes[:, :, 1], axes[:, :, 2]).mul_(axes[:, :, 0]).sum(1).sign()[:, None]
+        axes[:, :, 0] *= (
+            torch.linalg.cross(axes[:, :, 1], axes[:, :, 2])
+            .mul_(axes[:, :, 0])
+            .sum(1)
+            .sign()[:, None]
+        )
         # as covariances(): rounding leaves nothing of what is thinner
         variances = torch.maximum(variances, 1e-10 * variances[:, 2:]).clamp_min(MIN_DIVISOR)
         scales[rows] = 0.5 * variances.log()
@@ -133,8 +156,9 @@ def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
 
 
 def best_size_change(psnr_of: Callable[[float], float]) -> float:
-    """The best size change of those tried: three, and the top of the parabola through them, a little outside of them at
-    most. ``psnr_of`` gives the PSNR of the scene with a size change, dB."""
+    """The best size change of those tried: three, and the top of the parabola through them, a
+    little outside of them at most. ``psnr_of`` gives the PSNR of the scene with a size change,
+    dB."""
     changes = (-0.1, 0.0, 0.05)
     tried = {change: psnr_of(change) for change in changes}
     top = top_of_parabola(changes, list(tried.values()), margin=0.05)
@@ -143,15 +167,17 @@ def best_size_change(psnr_of: Callable[[float], float]) -> float:
 
 
 def top_of_parabola(at: tuple[float, float, float], values: list[float], margin: float) -> float:
-    """Where the parabola through three points is highest, at most ``margin`` outside of them. If it has no top, as far
-    out if the values only rise that way, else the best of the three.
+    """Where the parabola through three points is highest, at most ``margin`` outside of them. If it
+    has no top, as far out if the values only rise that way, else the best of the three.
 
     Example:
         >>> round(top_of_parabola((0.0, 1.0, 3.0), [-4.0, -1.0, -1.0], margin=0.0), 6)
         2.0
     """
-    (a, b, c), (p, q, r) = at, values
-    left, right = (q - p) / (b - a), (r - q) / (c - b)
+    (a, b, c) = at
+    (p, q, r) = values
+    left = (q - p) / (b - a)
+    right = (r - q) / (c - b)
     bend = (right - left) / (c - a)
     if bend >= 0 and left * right > 0:
         return c + margin if right > 0 else a - margin

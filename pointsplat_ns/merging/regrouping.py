@@ -1,14 +1,17 @@
 """How groups are regrouped: each member changes to the group near it that it fits best.
 
-Pairs are merged from the bottom up and are never separated. So some members end in a group whose other members lie
-elsewhere. As in k-means, each member then changes to the group that it fits best, and the groups are computed anew:
-hard EM of a mixture of Gaussians whose data are Gaussians (Vasconcelos and Lippman, Learning mixture hierarchies, NIPS
-1998). A member with mean mu, covariance S and colour c fits a group with mu_g, S_g and c_g by
+Pairs are merged from the bottom up and are never separated. So some members end in a group whose
+other members lie elsewhere. As in k-means, each member then changes to the group that it fits best,
+and the groups are computed anew: hard EM of a mixture of Gaussians whose data are Gaussians
+(Vasconcelos and Lippman, Learning mixture hierarchies, NIPS 1998). A member with mean mu,
+covariance S and colour c fits a group with mu_g, S_g and c_g by
 
-    fit = 1/2 (tr(S_g^-1 (S + (mu - mu_g)(mu - mu_g)^T)) + log det S_g) + |c - c_g|^2 / (2 contrast^2)
+    fit = 1/2 (tr(S_g^-1 (S + (mu - mu_g)(mu - mu_g)^T)) + log det S_g) + |c - c_g|^2 / (2
+    contrast^2)
 
-The less, the better: the expected negative log-density of the group over the member, and the difference of colour. The
-mass of a member, by which the moments of a group are weighted, is opacity times root mean square area.
+The less, the better: the expected negative log-density of the group over the member, and the
+difference of colour. The mass of a member, by which the moments of a group are weighted, is opacity
+times root mean square area.
 """
 
 from __future__ import annotations
@@ -42,8 +45,8 @@ from pointsplat_ns.system.threads import in_threads, in_turn
 
 
 class Members:
-    """n members of groups. Of their numbers, only masses are kept: the others are computed in pieces each time, which
-    takes less memory and, by the kernel, little time.
+    """n members of groups. Of their numbers, only masses are kept: the others are computed in
+    pieces each time, which takes less memory and, by the kernel, little time.
 
     Args:
         scene: N Gaussians.
@@ -51,9 +54,14 @@ class Members:
     """
 
     def __init__(self, scene: Gaussians, rows: Tensor):
-        self._scene, self._rows = scene, rows
+        self._scene = scene
+        self._rows = rows
         self.masses = in_pieces(
-            lambda some: torch.sigmoid(scene.opacities[some, 0].double()) * rms_area(covariances_of(scene, some)), rows
+            lambda some: (
+                torch.sigmoid(scene.opacities[some, 0].double())
+                * rms_area(covariances_of(scene, some))
+            ),
+            rows,
         )
         """Opacity times root mean square area, (n,)."""
 
@@ -88,24 +96,29 @@ class Moments:
         """Shares (m,) float64 of members with masses (m,) in the mass of their groups (m,)."""
         total = self.mass[group]
         return torch.where(
-            total > MIN_DIVISOR, masses / total.clamp_min(MIN_DIVISOR), 1 / self.sizes[group].to(masses.dtype)
+            total > MIN_DIVISOR,
+            masses / total.clamp_min(MIN_DIVISOR),
+            1 / self.sizes[group].to(masses.dtype),
         )
 
 
 def regrouped(participants: Participants, groups: Groups, settings: MergeSettings) -> Groups:
     """Groups whose members fit them better.
 
-    The mass of a group may differ from the sum of its members' masses, because members overlap. The ratio of both is
-    kept.
+    The mass of a group may differ from the sum of its members' masses, because members overlap. The
+    ratio of both is kept.
 
     Args:
         participants: n Gaussians.
         groups: their groups, of which membership, sizes and opacities count.
         settings: ``regrouping_rounds`` and how members choose.
     """
-    group, alphas, areas = groups.group, groups.alphas, areas_of(groups.cov)
+    group = groups.group
+    alphas = groups.alphas
+    areas = areas_of(groups.cov)
     del groups
-    members, count = Members(participants.scene, participants.members), len(alphas)
+    members = Members(participants.scene, participants.members)
+    count = len(alphas)
     common = group_moments(members, group, count)
     ratios = alphas * areas / common.mass.clamp_min(MIN_DIVISOR)
     for _ in range(settings.regrouping_rounds):
@@ -113,7 +126,9 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
         del common
         common = group_moments(members, group, count)
     alphas = torch.where(
-        common.mass > MIN_DIVISOR, ratios * common.mass / areas_of(common.cov).clamp_min(MIN_DIVISOR), alphas
+        common.mass > MIN_DIVISOR,
+        ratios * common.mass / areas_of(common.cov).clamp_min(MIN_DIVISOR),
+        alphas,
     )
     shares = in_pieces(
         lambda these: common.shares(members.masses[these], group[these]),
@@ -147,13 +162,25 @@ def group_moments(members: Members, group: Tensor, count: int) -> Moments:
     def zeros(*shape: int) -> Tensor:
         return members.masses.new_zeros(count, *shape)
 
-    mass, sizes = add_rows(zeros(), group, members.masses), torch.bincount(group, minlength=count)
+    mass = add_rows(zeros(), group, members.masses)
+    sizes = torch.bincount(group, minlength=count)
     found = Moments(mass, sizes, zeros(3), zeros(6), zeros(3))
-    spread = found.cov, lambda these: members.cov(these) + outer(members.means(these) - found.means[group[these]])
-    for total, values_of in ((found.means, members.means), (found.colours, members.colours), spread):
+    spread = (
+        found.cov,
+        lambda these: members.cov(these) + outer(members.means(these) - found.means[group[these]]),
+    )
+    for total, values_of in (
+        (found.means, members.means),
+        (found.colours, members.colours),
+        spread,
+    ):
 
-        def shared(these: slice, values_of: Callable[[slice], Tensor] = values_of) -> tuple[Tensor, Tensor]:
-            return group[these], found.shares(members.masses[these], group[these])[:, None] * values_of(these)
+        def shared(
+            these: slice, values_of: Callable[[slice], Tensor] = values_of
+        ) -> tuple[Tensor, Tensor]:
+            return group[these], found.shares(members.masses[these], group[these])[
+                :, None
+            ] * values_of(these)
 
         for own, values in in_turn(shared, members.pieces(), group.device):
             add_rows(total, own, values)
@@ -167,8 +194,8 @@ def best_groups(
     settings: MergeSettings = MERGING,
     compiled: bool | None = None,
 ) -> Tensor:
-    """The group (n,) that each member fits best, of its own and the six nearest. The heaviest member of each group
-    stays, so that no group is empty.
+    """The group (n,) that each member fits best, of its own and the six nearest. The heaviest
+    member of each group stays, so that no group is empty.
 
     Args:
         members: n members.
@@ -177,13 +204,18 @@ def best_groups(
         settings: ``regrouping_contrast``.
         compiled: False leaves it to torch; True warns if there are no kernels.
     """
-    inverse, log_determinants = torch.empty_like(groups.cov), torch.empty_like(groups.mass)
-    occurrences = groups.cov.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the numbers of a symmetric matrix
+    inverse = torch.empty_like(groups.cov)
+    log_determinants = torch.empty_like(groups.mass)
+    occurrences = groups.cov.new_tensor(
+        [1.0, 2.0, 2.0, 1.0, 2.0, 1.0]
+    )  # of the numbers of a symmetric matrix
 
     def invert(some: slice) -> None:
         cov = groups.cov[some]
         variance = diagonals(cov).mean(1).clamp_min(MIN_DIVISOR)
-        shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES).to(cov.device)  # invertible if flat
+        shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES).to(
+            cov.device
+        )  # invertible if flat
         inverses, logs = inverses_and_log_determinants(shapes)
         inverse[some] = pack(inverses) * (occurrences / variance[:, None])
         log_determinants[some] = logs + 3 * variance.log()
@@ -191,18 +223,32 @@ def best_groups(
     in_threads(invert, pieces(len(groups.mass), group.device), group.device)
     colour_weight = 1 / (2 * settings.regrouping_contrast**2)
 
-    result, nearest = torch.empty_like(group), NearestOf(groups.means, 6)
+    result = torch.empty_like(group)
+    nearest = NearestOf(groups.means, 6)
 
     def choose(these: slice) -> None:
-        means, cov, colours, own = members.means(these), members.cov(these), members.colours(these), group[these]
+        means = members.means(these)
+        cov = members.cov(these)
+        colours = members.colours(these)
+        own = group[these]
         near = nearest(means)
         if KERNELS.usable_for(compiled, colours):
             best = torch.empty_like(own)
             task = KERNELS.structs["Choice"](
-                means=means, cov=cov, colours=colours, group=own, near=near.int(), count=len(own),
-                candidates=near.shape[1], group_means=groups.means, inverse=inverse, best=best,
-                log_determinants=log_determinants, group_colours=groups.colours, colour_weight=colour_weight,
-            )  # fmt: skip
+                means=means,
+                cov=cov,
+                colours=colours,
+                group=own,
+                near=near.int(),
+                count=len(own),
+                candidates=near.shape[1],
+                group_means=groups.means,
+                inverse=inverse,
+                best=best,
+                log_determinants=log_determinants,
+                group_colours=groups.colours,
+                colour_weight=colour_weight,
+            )
             on_threads(len(own) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task)
             result[these] = best
             return

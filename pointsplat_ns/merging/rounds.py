@@ -1,9 +1,10 @@
 """The loop of merging: rounds of pairs until the count is reached, then the scene of what remains.
 
-Everything is computed on the device of the scene. On a CPU, pieces of work take one thread each: the result is the same
-bits on any number of threads, and no thread waits for another within an operation. On a GPU, torch does without kernels
-and rounds in another way; where its memory is too small, the CPU merges. Besides the scene itself, at most 0.35 kB a
-Gaussian are taken; freed blocks are given back to the system before steps that take much.
+Everything is computed on the device of the scene. On a CPU, pieces of work take one thread each:
+the result is the same bits on any number of threads, and no thread waits for another within an
+operation. On a GPU, torch does without kernels and rounds in another way; where its memory is too
+small, the CPU merges. Besides the scene itself, at most 0.35 kB a Gaussian are taken; freed blocks
+are given back to the system before steps that take much.
 """
 
 from __future__ import annotations
@@ -45,8 +46,10 @@ class Merged:
     """The result of merging."""
 
     scene: Gaussians
-    """K Gaussians in the order of their first members. Those not merged with any other are unchanged to the bit."""
-    assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
+    """K Gaussians in the order of their first members. Those not merged with any other are
+    unchanged to the bit."""
+    # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
+    assignment: Tensor
     size_change: float = 0.0
     """Added to the log-scales of merged Gaussians, chosen by renders."""
 
@@ -67,13 +70,13 @@ def merge(
     Gaussians too faint to be drawn are dropped first.
 
     Args:
-        scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.gaussians.Gaussians.usable` are dropped, unless
-            ``k`` is N.
+        scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.gaussians.Gaussians.usable` are
+            dropped, unless ``k`` is N.
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
-        views: views in which the result should look the same, such as the poses of the scene's photos. What none of
-            them shows is merged first. A sampler of the same scene, or of one that looks the same, samples them; by
-            default a new one does.
+        views: views in which the result should look the same, such as the poses of the scene's
+            photos. What none of them shows is merged first. A sampler of the same scene, or of one
+            that looks the same, samples them; by default a new one does.
         settings: the tuned numbers.
 
     Returns:
@@ -94,8 +97,9 @@ def merge_levels(
 ) -> Iterator[Merged]:
     """Replace a scene by fewer and fewer Gaussians in one pass.
 
-    Each level is merged from the one before: Gaussians that are one in a level are one in all that follow. So several
-    levels are not regrouped, and each is a little worse than what :func:`merge` makes.
+    Each level is merged from the one before: Gaussians that are one in a level are one in all that
+    follow. So several levels are not regrouped, and each is a little worse than what :func:`merge`
+    makes.
 
     Args:
         scene: N Gaussians, see :func:`merge`.
@@ -107,20 +111,23 @@ def merge_levels(
         A level for each count, as soon as it is reached.
 
     Raises:
-        BudgetError: if a count is not in 1..N, the counts do not descend, or the first is more than can be drawn.
+        BudgetError: if a count is not in 1..N, the counts do not descend, or the first is more than
+            can be drawn.
     """
     n = len(scene)
     for k in counts:
         if not 1 <= k <= n:
             raise BudgetError(f"cannot merge {n} Gaussians into {k}; expected 1 to {n}")
     if any(fewer >= more for more, fewer in itertools.pairwise(counts)):
-        raise BudgetError(f"levels of {', '.join(map(str, counts))} Gaussians; expected descending counts")
+        raise BudgetError(
+            f"levels of {', '.join(map(str, counts))} Gaussians; expected descending counts"
+        )
     return _levels(scene, counts, progress or (lambda share: None), views, settings)
 
 
 def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Result]) -> Result:
-    """The result of a function of a scene; of the scene on the CPU, if a GPU has too little memory for it, or lacks
-    float64."""
+    """The result of a function of a scene; of the scene on the CPU, if a GPU has too little memory
+    for it, or lacks float64."""
     if scene.device.type == "mps":
         scene = scene.to("cpu")
     try:
@@ -128,13 +135,17 @@ def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Resul
     except torch.OutOfMemoryError:
         if scene.device.type == "cpu":
             raise
-        logger.warning("%s has too little memory to merge %d Gaussians: the CPU does, slower", scene.device, len(scene))
+        logger.warning(
+            "%s has too little memory to merge %d Gaussians: the CPU does, slower",
+            scene.device,
+            len(scene),
+        )
     return function(scene.to("cpu"))
 
 
 class Merger:
-    """Merges one scene to several counts, each as :func:`merge` does. The views, and all rounds before the last one of
-    a count, are those of every smaller count as well, and are made once.
+    """Merges one scene to several counts, each as :func:`merge` does. The views, and all rounds
+    before the last one of a count, are those of every smaller count as well, and are made once.
 
     The steps that are kept take at most 0.4 kB for each Gaussian of the scene.
 
@@ -142,8 +153,15 @@ class Merger:
         scene, views, settings: as for :func:`merge`.
     """
 
-    def __init__(self, scene: Gaussians, views: Views | Sampler | None = None, settings: MergeSettings = MERGING):
-        self._scene, self._device, self._options = scene, scene.device, (views, settings)
+    def __init__(
+        self,
+        scene: Gaussians,
+        views: Views | Sampler | None = None,
+        settings: MergeSettings = MERGING,
+    ):
+        self._scene = scene
+        self._device = scene.device
+        self._options = (views, settings)
         self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
 
     @torch.no_grad()
@@ -153,7 +171,8 @@ class Merger:
 
         def on(scene: Gaussians) -> Merged:
             if scene is not self._scene:  # it was moved, which the steps before were not
-                self._scene, self._steps = scene, []
+                self._scene = scene
+                self._steps = []
             return self._merged(k, report)
 
         return _on_cpu_if_too_large(self._scene, on).to(self._device)
@@ -162,7 +181,9 @@ class Merger:
         views, settings = self._options
         if not self._steps and 1 <= k < len(self._scene):
             self._steps.append(first_step(self._scene, 1, views, settings, report=report))
-        if not self._steps or not 1 <= k <= len(self._steps[0].state):  # faint Gaussians are among them
+        if not self._steps or not 1 <= k <= len(
+            self._steps[0].state
+        ):  # faint Gaussians are among them
             return merge(self._scene, k, report, views, settings)
         step = next(step for step in reversed(self._steps) if len(step.state) >= k)
         first = len(step.state)
@@ -242,8 +263,8 @@ def first_step(
     last: int = 0,
     report: Callable[[float], None] = lambda share: None,
 ) -> Step:
-    """The step before the first round, of at least ``k`` Gaussians; ``views`` as for :func:`merge`. Nothing is rendered
-    if they are no more than the ``last`` count, so that no round follows."""
+    """The step before the first round, of at least ``k`` Gaussians; ``views`` as for :func:`merge`.
+    Nothing is rendered if they are no more than the ``last`` count, so that no round follows."""
     with one_thread_each():
         members = drawable(scene, k)
         begin: list[Callable[[], Any]] = [lambda: Participants.of(scene, members)]
@@ -255,10 +276,15 @@ def first_step(
                 begin.append(import_tree)
         participants, *_ = in_turn(lambda step: step(), begin, scene.device)
         give_back_freed_memory()  # of threads that have ended
-        found, weights = None, torch.ones_like(participants.members, dtype=torch.float32)
+        found = None
+        weights = torch.ones_like(participants.members, dtype=torch.float32)
         if len(participants) > last:
-            found, weights = views_and_weights(participants, views, settings, lambda share: report(0.5 * share))
-        return _with_reference(Step(participants, found, initial_state(participants, weights)), settings)
+            found, weights = views_and_weights(
+                participants, views, settings, lambda share: report(0.5 * share)
+            )
+        return _with_reference(
+            Step(participants, found, initial_state(participants, weights)), settings
+        )
 
 
 def most_pairs(n: int, settings: MergeSettings) -> int:
@@ -282,25 +308,40 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
 
 
 def _with_reference(step: Step, settings: MergeSettings) -> Step:
-    """A step with renders that results are compared with, in every few pixels of pictures of the middle size
-    (:func:`~pointsplat_ns.comparing.sizes.sides_of`), unless there are some, too many Gaussians, or no views."""
-    everyone, views = step.participants, step.views
-    if step.reference or views is None or len(step.state) > settings.max_count_rendered or settings.finish_views < 1:
+    """A step with renders that results are compared with, in every few pixels of pictures of the
+    middle size (:func:`~pointsplat_ns.comparing.sizes.sides_of`), unless there are some, too many
+    Gaussians, or no views."""
+    everyone = step.participants
+    views = step.views
+    if (
+        step.reference
+        or views is None
+        or len(step.state) > settings.max_count_rendered
+        or settings.finish_views < 1
+    ):
         return step
     if step.rounds:
         dense = scene_maker(everyone, step.groups(), settings)[1](0.0)
     else:
-        dense = everyone.scene if len(everyone) == len(everyone.scene) else everyone.scene[everyone.members]
+        dense = (
+            everyone.scene
+            if len(everyone) == len(everyone.scene)
+            else everyone.scene[everyone.members]
+        )
     unit = everyone.centre, everyone.size
     views = views_in_units(views.spread(settings.finish_views), *unit)
-    return replace(step, reference=RendersOfSizes(in_units(dense, *unit), views, [middle_side(views)]))
+    return replace(
+        step, reference=RendersOfSizes(in_units(dense, *unit), views, [middle_side(views)])
+    )
 
 
 def _result(step: Step, regroup: bool, settings: MergeSettings) -> Merged:
     """The result after some rounds."""
-    participants, reference = step.participants, step.reference
+    participants = step.participants
+    reference = step.reference
     with one_thread_each():
-        groups, size_change = step.groups(), 0.0
+        groups = step.groups()
+        size_change = 0.0
         any_merged = groups.any_merged
         if regroup and any_merged and settings.regrouping_rounds > 0:
             groups = regrouped(participants, groups, settings)
@@ -309,7 +350,9 @@ def _result(step: Step, regroup: bool, settings: MergeSettings) -> Merged:
         del groups
         if reference is not None and any_merged:
             unit = participants.centre, participants.size
-            size_change = best_size_change(lambda change: reference.psnr(in_units(make(change), *unit)))
+            size_change = best_size_change(
+                lambda change: reference.psnr(in_units(make(change), *unit))
+            )
         scene = make(size_change)
     assignment = group.new_full((len(participants.scene),), -1)
     assignment[participants.members] = group

@@ -33,7 +33,8 @@ class Participants:
     """The Gaussians that are merged, and the scene that they are part of."""
 
     scene: Gaussians  # N Gaussians; merging computes on their device
-    members: Tensor  # [n] int64, indices in the scene, along a space-filling curve: neighbours are near in memory
+    # [n] int64, indices in the scene, along a space-filling curve: neighbours are near in memory
+    members: Tensor
     centre: Tensor  # [3] float64, on the CPU, of the scene's content
     size: float
     """Diagonal of the scene's content, scene units."""
@@ -51,20 +52,26 @@ class Participants:
 
 
 def drawable(scene: Gaussians, k: int) -> Tensor:
-    """Ascending indices of the Gaussians that can be drawn; if they are fewer than ``k``, also of the most opaque ones
-    that are too faint.
+    """Ascending indices of the Gaussians that can be drawn; if they are fewer than ``k``, also of
+    the most opaque ones that are too faint.
 
     Raises:
         BudgetError: if fewer than ``k`` have finite parameters.
     """
     usable = scene.usable()
     if int(usable.sum()) < k:
-        raise BudgetError(f"cannot keep {k} Gaussians: {int(usable.sum())} of {len(scene)} have finite parameters")
+        raise BudgetError(
+            f"cannot keep {k} Gaussians: {int(usable.sum())} of {len(scene)} have finite parameters"
+        )
     chosen = usable & (scene.alphas >= ALPHA_MIN)
     missing = k - int(chosen.sum())
     if missing > 0:
         faint = usable & ~chosen
-        order = torch.where(faint, scene.opacities[:, 0], -math.inf).sort(descending=True, stable=True).indices
+        order = (
+            torch.where(faint, scene.opacities[:, 0], -math.inf)
+            .sort(descending=True, stable=True)
+            .indices
+        )
         chosen[order[faint[order]][:missing]] = True
     return chosen.nonzero()[:, 0]
 
@@ -73,7 +80,8 @@ def drawable(scene: Gaussians, k: int) -> Tensor:
 class State:
     """The Gaussians that remain after some rounds.
 
-    Costs are of float32, and the shapes of groups are computed anew at the end, so that more digits would not show.
+    Costs are of float32, and the shapes of groups are computed anew at the end, so that more digits
+    would not show.
     """
 
     means: Tensor  # [n, 3] float32, around the centre, in units of the size
@@ -101,15 +109,27 @@ def initial_state(
         colour_axes: as of :func:`principal_axes`; by default those of the participants.
         dtype: float64 for a reference, which kernels do not take.
     """
-    scene, members = participants.scene, participants.members
-    centre, size = participants.centre.to(members.device, torch.float64), participants.size
+    scene = participants.scene
+    members = participants.members
+    centre = participants.centre.to(members.device, torch.float64)
+    size = participants.size
     middle, axes = colour_axes or principal_axes(scene, members)
     return State(
-        means=in_pieces(lambda rows: (scene.means[rows].double() - centre) / size, members, 3, dtype=dtype),
-        cov=in_pieces(lambda rows: (covariances_of(scene, rows) / size**2).clamp(-1e30, 1e30), members, 6, dtype=dtype),
+        means=in_pieces(
+            lambda rows: (scene.means[rows].double() - centre) / size, members, 3, dtype=dtype
+        ),
+        cov=in_pieces(
+            lambda rows: (covariances_of(scene, rows) / size**2).clamp(-1e30, 1e30),
+            members,
+            6,
+            dtype=dtype,
+        ),
         alphas=torch.sigmoid(scene.opacities[members, 0]).to(dtype),
         colours=in_pieces(
-            lambda rows: (_coefficients(scene, rows) - middle) @ axes, members, axes.shape[1], dtype=torch.float32
+            lambda rows: (_coefficients(scene, rows) - middle) @ axes,
+            members,
+            axes.shape[1],
+            dtype=torch.float32,
         ),
         weights=weights.float(),
         counts=torch.ones_like(members, dtype=torch.int32),
@@ -117,7 +137,8 @@ def initial_state(
 
 
 def bounded_colours(coefficients: Tensor) -> Tensor:
-    """SH coefficients in colour units, float32, within bounds: a few broken colours must not hide all others."""
+    """SH coefficients in colour units, float32, within bounds: a few broken colours must not hide
+    all others."""
     return (coefficients.float() * SH_C0).clamp_(-10.0, 10.0)
 
 
@@ -128,16 +149,20 @@ def _coefficients(scene: Gaussians, rows: Tensor) -> Tensor:
 
 
 def principal_axes(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean of all SH coefficients of members (n,), (3 (d+1)^2,) float32, colour units, and their principal axes,
-    (3 (d+1)^2, C) float32, orthogonal, each of length 1.
+    """The mean of all SH coefficients of members (n,), (3 (d+1)^2,) float32, colour units, and
+    their principal axes, (3 (d+1)^2, C) float32, orthogonal, each of length 1.
 
-    By Parseval's theorem, the coefficients of every band contribute to the mean square over directions as the constant
-    does. Eight axes hold nearly all of the variance.
+    By Parseval's theorem, the coefficients of every band contribute to the mean square over
+    directions as the constant does. Eight axes hold nearly all of the variance.
     """
     width = 3 + 3 * scene.features_rest.shape[1]
     first, *_ = parts = pieces(len(members), members.device)
-    shift = _coefficients(scene, members[first]).mean(0)  # near the mean, so that float32 holds the squares
-    total, products = (torch.zeros(*shape, **DOUBLES).to(members.device) for shape in ((width,), (width, width)))
+    shift = _coefficients(scene, members[first]).mean(
+        0
+    )  # near the mean, so that float32 holds the squares
+    total, products = (
+        torch.zeros(*shape, **DOUBLES).to(members.device) for shape in ((width,), (width, width))
+    )
 
     def sums(these: slice) -> tuple[Tensor, Tensor]:
         values = _coefficients(scene, members[these]) - shift

@@ -1,10 +1,12 @@
-"""Visibility weight of each Gaussian: the pixels that it covers per unit of its own area. Errors count by it.
+"""Visibility weight of each Gaussian: the pixels that it covers per unit of its own area. Errors
+count by it.
 
-A Gaussian covers the sum over pixels of its blend weight, alpha times transmittance. Divided by its opacity and area,
-that is large near the cameras, small far away, and 0 behind a wall.
+A Gaussian covers the sum over pixels of its blend weight, alpha times transmittance. Divided by its
+opacity and area, that is large near the cameras, small far away, and 0 behind a wall.
 
-Pictures are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would make Gaussians below the
-size of a pixel seem large. The antialiased rasterizer lowers their opacity by as much, so it counts right.
+Pictures are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would make
+Gaussians below the size of a pixel seem large. The antialiased rasterizer lowers their opacity by
+as much, so it counts right.
 """
 
 from __future__ import annotations
@@ -36,16 +38,24 @@ def views_and_weights(
     settings: MergeSettings,
     report: Callable[[float], None] = lambda share: None,
 ) -> tuple[Views | None, Tensor]:
-    """The views that visibility is computed in, and the visibility weights (n,) of participants, with trace factors
-    where they count. Arguments are those of :func:`views_to_weigh` and :func:`visibility_weights`."""
+    """The views that visibility is computed in, and the visibility weights (n,) of participants,
+    with trace factors where they count. Arguments are those of :func:`views_to_weigh` and
+    :func:`visibility_weights`."""
     found, traced = views_to_weigh(len(participants), views, settings)
     report(0.6)
-    weights = visibility_weights(participants, found, settings, lambda share: report(0.6 + 0.4 * share))
-    return found, weights * trace_factors(participants.scene, participants.members) if traced else weights
+    weights = visibility_weights(
+        participants, found, settings, lambda share: report(0.6 + 0.4 * share)
+    )
+    return found, weights * trace_factors(
+        participants.scene, participants.members
+    ) if traced else weights
 
 
-def views_to_weigh(count: int, views: Views | Sampler | None, settings: MergeSettings) -> tuple[Views | None, bool]:
-    """The views that visibility is computed in, and whether trace factors (:mod:`~pointsplat_ns.looking.traces`) count.
+def views_to_weigh(
+    count: int, views: Views | Sampler | None, settings: MergeSettings
+) -> tuple[Views | None, bool]:
+    """The views that visibility is computed in, and whether trace factors
+    (:mod:`~pointsplat_ns.looking.traces`) count.
 
     Args:
         count: number of Gaussians that are merged.
@@ -53,7 +63,8 @@ def views_to_weigh(count: int, views: Views | Sampler | None, settings: MergeSet
         settings: ``min_count_rendered``, ``sampled_views`` and ``view_seed``.
 
     Returns:
-        No views for a small scene without known ones, if nothing is visible, or if no view is asked for.
+        No views for a small scene without known ones, if nothing is visible, or if no view is asked
+        for.
     """
     if isinstance(views, Views):
         return views, False
@@ -69,7 +80,8 @@ def visibility_weights(
     settings: MergeSettings,
     report: Callable[[float], None] = lambda share: None,
 ) -> Tensor:
-    """The visibility weights (n,) of participants, by one of every so many of them along the curve; 1 without views.
+    """The visibility weights (n,) of participants, by one of every so many of them along the curve;
+    1 without views.
 
     Args:
         participants: n Gaussians.
@@ -77,7 +89,8 @@ def visibility_weights(
         settings: ``max_count_drawn`` and those of :func:`covered_per_area`.
         report: called with the share done.
     """
-    scene, members = participants.scene, participants.members
+    scene = participants.scene
+    members = participants.members
     if views is None:
         return torch.ones_like(members, dtype=torch.float32)
     step = drawn_step(len(members), settings)
@@ -110,7 +123,8 @@ def covered_per_area(
         report: called with the share of the views done.
 
     Returns:
-        (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows enough to tell.
+        (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows
+        enough to tell.
     """
     covered = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     small = views.spread(settings.visibility_views).resized(112)

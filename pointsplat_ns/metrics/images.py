@@ -1,7 +1,8 @@
-"""Image metrics: PSNR and SSIM (LPIPS, which needs weights, is in :mod:`pointsplat_ns.metrics.lpips`).
+"""Image metrics: PSNR and SSIM (LPIPS, which needs weights, is in
+:mod:`pointsplat_ns.metrics.lpips`).
 
-Images are (H, W, 3) or (B, H, W, 3), in [0, 1]; values are not clamped. Each metric returns a scalar for one image and
-(B,) for a batch, one value per image.
+Images are (H, W, 3) or (B, H, W, 3), in [0, 1]; values are not clamped. Each metric returns a
+scalar for one image and (B,) for a batch, one value per image.
 """
 
 from __future__ import annotations
@@ -20,17 +21,23 @@ class ImageError(PointSplatError, ValueError):
 
 
 def as_nchw(pred: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Both images as (B, 3, H, W), B = 1 for single ones. Raises ImageError if their shapes differ, are not (H, W, 3)
-    or (B, H, W, 3), or hold no pixel, or if a type is not floating-point."""
+    """Both images as (B, 3, H, W), B = 1 for single ones. Raises ImageError if their shapes differ,
+    are not (H, W, 3) or (B, H, W, 3), or hold no pixel, or if a type is not floating-point."""
     for name, image in (("pred", pred), ("target", target)):
         if image.dim() not in (3, 4) or image.shape[-1] != 3 or image.numel() == 0:
-            raise ImageError(f"{name} has shape {tuple(image.shape)}; expected (H, W, 3) or (B, H, W, 3)")
+            raise ImageError(
+                f"{name} has shape {tuple(image.shape)}; expected (H, W, 3) or (B, H, W, 3)"
+            )
         if not image.is_floating_point():
             raise ImageError(f"{name} is {image.dtype}; expected a floating-point image in [0, 1]")
     if pred.shape != target.shape:
-        raise ImageError(f"pred has shape {tuple(pred.shape)} but target {tuple(target.shape)}; expected the same")
+        raise ImageError(
+            f"pred has shape {tuple(pred.shape)} but target {tuple(target.shape)}; expected the "
+            "same"
+        )
     if pred.dim() == 3:
-        pred, target = pred[None], target[None]
+        pred = pred[None]
+        target = target[None]
     return pred.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2)
 
 
@@ -63,11 +70,12 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
 
 
 def psnr_of(error: float, covered: float = 1.0) -> float:
-    """PSNR over the pixels that a scene covers, dB: all squared error, halos beside the scene included, divided by the
-    share of the pixels that it covers. Empty background does not make it better.
+    """PSNR over the pixels that a scene covers, dB: all squared error, halos beside the scene
+    included, divided by the share of the pixels that it covers. Empty background does not make it
+    better.
 
-    ``error`` is the mean squared error over all pixels, data range 1. Where the share ``covered``, in [0, 1], is 0, all
-    pixels count. inf for no error, NaN for NaN.
+    ``error`` is the mean squared error over all pixels, data range 1. Where the share ``covered``,
+    in [0, 1], is 0, all pixels count. inf for no error, NaN for NaN.
 
     Example:
         >>> psnr_of(0.001), psnr_of(0.001, covered=0.1)
@@ -90,11 +98,11 @@ def finite_psnr(pred: Tensor, target: Tensor) -> float:
 def ssim(pred: Tensor, target: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004), data range 1.
 
-    11 x 11 Gaussian window of sigma 1.5, population moments, averaged over the channels and over the
-    pixels whose whole window lies inside the image, as in the original publication. pytorch-msssim, and
-    so Splatfacto, computes the same. Others pad the image and average over the border, too: torchmetrics
-    by reflection, the original 3DGS code with zeros. Their values differ a little and should not be
-    compared with these.
+    11 x 11 Gaussian window of sigma 1.5, population moments, averaged over the channels and over
+    the pixels whose whole window lies inside the image, as in the original publication.
+    pytorch-msssim, and so Splatfacto, computes the same. Others pad the image and average over the
+    border, too: torchmetrics by reflection, the original 3DGS code with zeros. Their values differ
+    a little and should not be compared with these.
 
     Args:
         pred: (H, W, 3) or (B, H, W, 3), in [0, 1], at least 11 pixels a side.
@@ -120,5 +128,7 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
             f"expected at least {SSIM_WINDOW} x {SSIM_WINDOW}"
         )
     # eps=0: the two constants of the definition already keep the denominator positive.
-    values = kornia.metrics.ssim(a.contiguous(), b.contiguous(), SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
+    values = kornia.metrics.ssim(
+        a.contiguous(), b.contiguous(), SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid"
+    )
     return per_image(values.mean(dim=(1, 2, 3)), pred)

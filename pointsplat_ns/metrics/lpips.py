@@ -1,8 +1,9 @@
 """LPIPS: perceptual distance of images (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep
 Features as a Perceptual Metric").
 
-The network is torchmetrics', with its linear weights, on torchvision's AlexNet or VGG16. If the weights of these are
-not available, :func:`load_lpips` says why, and everything else works without LPIPS.
+The network is torchmetrics', with its linear weights, on torchvision's AlexNet or VGG16. If the
+weights of these are not available, :func:`load_lpips` says why, and everything else works without
+LPIPS.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ WEIGHTS_VARIABLE = "POINTSPLAT_LPIPS_WEIGHTS"
 
 
 class LpipsUnavailable(PointSplatError):
-    """The weights of LPIPS, or torchvision, are not available; the message says why, in one line."""
+    """The weights of LPIPS, or torchvision, are not available; the message says why, in one
+    line."""
 
 
 class _Backbone(NamedTuple):
@@ -61,7 +63,9 @@ class Lpips(nn.Module):
             import torchvision  # noqa: F401  # torchmetrics' own error does not tell why
             from torchmetrics.functional.image.lpips import _LPIPS, ScalingLayer
         except (ImportError, RuntimeError) as error:  # not installed, or built for another torch
-            raise LpipsUnavailable(f"LPIPS needs torchvision, which cannot be imported ({one_line(error)})") from error
+            raise LpipsUnavailable(
+                f"LPIPS needs torchvision, which cannot be imported ({one_line(error)})"
+            ) from error
         self.net = net
         with torch.device("meta"):  # no random numbers are drawn for weights that are replaced
             self.network = _LPIPS(pretrained=False, net=net, pnet_rand=True)
@@ -69,40 +73,48 @@ class Lpips(nn.Module):
             self.network.scaling_layer = ScalingLayer().float()  # constants, which are in no file
 
     def load(self, path: Path) -> Lpips:
-        """This network, frozen, with the weights of a backbone's file: the whole backbone or its convolutions alone.
-        Raises LpipsUnavailable if the file holds others."""
+        """This network, frozen, with the weights of a backbone's file: the whole backbone or its
+        convolutions alone. Raises LpipsUnavailable if the file holds others."""
         from torchmetrics.functional.image import lpips
 
         linear = Path(lpips.__file__).with_name("lpips_models") / f"{self.net}.pth"
         weights = torch.load(linear, map_location="cpu", weights_only=True)
         try:
             backbone = torch.load(path, map_location="cpu", weights_only=True)
-            for name in self.network.net.state_dict():  # slice2.5.weight is torchvision's features.5.weight
+            for name in (
+                self.network.net.state_dict()
+            ):  # slice2.5.weight is torchvision's features.5.weight
                 weights[f"net.{name}"] = backbone[f"features.{name.partition('.')[2]}"].float()
             self.network.load_state_dict(weights, strict=False, assign=True)
         except Exception as error:  # a damaged pickle can raise nearly anything
             why = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-            raise LpipsUnavailable(f"{path}: not the weights of LPIPS's {self.net} backbone ({why})") from error
+            raise LpipsUnavailable(
+                f"{path}: not the weights of LPIPS's {self.net} backbone ({why})"
+            ) from error
         return self.requires_grad_(False)
 
     def forward(self, pred: Tensor, target: Tensor) -> Tensor:
-        """LPIPS of each image pair, in float32; arguments, result and errors are those of :func:`lpips`."""
+        """LPIPS of each image pair, in float32; arguments, result and errors are those of
+        :func:`lpips`."""
         a, b = as_nchw(pred, target)
         least = _BACKBONES[self.net].minimum
         if min(a.shape[2:]) < least:
             raise ImageError(
-                f"images of {a.shape[3]} x {a.shape[2]} pixels are too small for LPIPS with {self.net}; "
-                f"expected at least {least} x {least}"
+                f"images of {a.shape[3]} x {a.shape[2]} pixels are too small for LPIPS with "
+                f"{self.net}; expected at least {least} x {least}"
             )
-        return per_image(self.network(a.float(), b.float(), normalize=True).flatten().to(pred.dtype), pred)
+        return per_image(
+            self.network(a.float(), b.float(), normalize=True).flatten().to(pred.dtype), pred
+        )
 
 
 def load_lpips(net: Net = "alex", download: bool = True) -> Lpips:
     """LPIPS with its weights, on the CPU.
 
     The backbone comes from the first of these that there is: what the environment variable
-    ``POINTSPLAT_LPIPS_WEIGHTS`` names; torch hub's checkpoint cache; torchvision's download into that cache. A file may
-    hold the whole network or its convolutions alone, and is loaded with ``weights_only=True``.
+    ``POINTSPLAT_LPIPS_WEIGHTS`` names; torch hub's checkpoint cache; torchvision's download into
+    that cache. A file may hold the whole network or its convolutions alone, and is loaded with
+    ``weights_only=True``.
 
     Args:
         net: ``"alex"`` (in most papers) or ``"vgg"`` (in most losses).
@@ -112,16 +124,20 @@ def load_lpips(net: Net = "alex", download: bool = True) -> Lpips:
         LpipsUnavailable: if the weights are not available, or torchvision is not.
     """
     if net not in _BACKBONES:
-        raise LpipsUnavailable(f"no LPIPS network is called {net!r}; expected one of {', '.join(_BACKBONES)}")
-    network, path = Lpips(net), _file(net)
+        raise LpipsUnavailable(
+            f"no LPIPS network is called {net!r}; expected one of {', '.join(_BACKBONES)}"
+        )
+    network = Lpips(net)
+    path = _file(net)
     if not path.is_file():
         _download(net, path, download)
     return network.load(path)
 
 
 def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
-    """LPIPS on a device, loaded at the first call and the same object afterwards. Arguments and errors are those of
-    :func:`load_lpips`. A failed download is not tried again, unless a file is found."""
+    """LPIPS on a device, loaded at the first call and the same object afterwards. Arguments and
+    errors are those of :func:`load_lpips`. A failed download is not tried again, unless a file is
+    found."""
     path = _file(net) if net in _BACKBONES else Path()
     found = _loaded(net, str(torch.device(device)), path, path.is_file())
     if isinstance(found, str):
@@ -139,24 +155,28 @@ def _loaded(net: Net, device: str, path: Path, there: bool) -> Lpips | str:
 
 
 class ReportedLpips:
-    """LPIPS for reports, which returns None instead of raising if LPIPS is not available. Not a module, so that
-    checkpoints of a model do not hold its weights."""
+    """LPIPS for reports, which returns None instead of raising if LPIPS is not available. Not a
+    module, so that checkpoints of a model do not hold its weights."""
 
     reason: str | None = None
     """The latest reason for a missing value; None while none is missing."""
 
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
-        """LPIPS by AlexNet as :func:`lpips` gives it; None, with ``reason`` set, where it cannot be computed."""
+        """LPIPS by AlexNet as :func:`lpips` gives it; None, with ``reason`` set, where it cannot be
+        computed."""
         try:
             return cached_lpips("alex", pred.device)(pred, target)
-        except (LpipsUnavailable, ImageError) as error:  # no weights, or an image too small for the network
+        except (
+            LpipsUnavailable,
+            ImageError,
+        ) as error:  # no weights, or an image too small for the network
             self.reason = str(error)
             return None
 
 
 def _file(net: Net) -> Path:
-    """The backbone's file: what the environment variable names, else torch hub's, which may not be there.
-    LpipsUnavailable if the variable names no folder."""
+    """The backbone's file: what the environment variable names, else torch hub's, which may not be
+    there. LpipsUnavailable if the variable names no folder."""
     files = _BACKBONES[net].files
     if named := os.environ.get(WEIGHTS_VARIABLE):
         folder = Path(named).expanduser()
@@ -169,7 +189,8 @@ def _file(net: Net) -> Path:
 
 
 def _download(net: Net, target: Path, allowed: bool) -> None:
-    """Download torchvision's file into torch hub's cache, atomically. A file with another SHA-256 is not kept."""
+    """Download torchvision's file into torch hub's cache, atomically. A file with another SHA-256
+    is not kept."""
     remedy = f"set {WEIGHTS_VARIABLE} to a folder with {' or '.join(_BACKBONES[net].files)}"
     if not allowed:
         raise LpipsUnavailable(f"{target}: LPIPS's {net} backbone is not there; {remedy}")
@@ -180,7 +201,9 @@ def _download(net: Net, target: Path, allowed: bool) -> None:
         url = f"https://download.pytorch.org/models/{target.name}"
         torch.hub.download_url_to_file(url, str(target), _BACKBONES[net].digest, progress=False)
     except Exception as error:  # no route, no name, a proxy's page, a full disk: all mean no LPIPS
-        raise LpipsUnavailable(f"LPIPS's {net} backbone cannot be downloaded ({one_line(error)}); {remedy}") from error
+        raise LpipsUnavailable(
+            f"LPIPS's {net} backbone cannot be downloaded ({one_line(error)}); {remedy}"
+        ) from error
     finally:
         socket.setdefaulttimeout(timeout)
 
@@ -192,7 +215,8 @@ def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") ->
     ``POINTSPLAT_LPIPS_WEIGHTS`` names a folder with them.
 
     Args:
-        pred: (H, W, 3) or (B, H, W, 3), in [0, 1]; at least 31 pixels a side for "alex", 16 for "vgg".
+        pred: (H, W, 3) or (B, H, W, 3), in [0, 1]; at least 31 pixels a side for "alex", 16 for
+            "vgg".
         target: the same shape.
         net: the backbone: "alex" as in most papers, "vgg" as in most losses.
 

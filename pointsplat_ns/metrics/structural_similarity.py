@@ -1,9 +1,10 @@
 """A fast SSIM for training losses.
 
-It is defined as in pytorch-msssim, which Splatfacto uses, and in :func:`pointsplat_ns.ssim`, which uses kornia. Both
-blur five maps one after the other. Here a compiled kernel (``structural_similarity.cpp``) does all at once, for float32
-on a CPU where it was built; elsewhere torch blurs them together, which takes about half the time of one by one. Tests
-check that all agree.
+It is defined as in pytorch-msssim, which Splatfacto uses, and in :func:`pointsplat_ns.ssim`, which
+uses kornia. Both blur five maps one after the other. Here a compiled kernel
+(``structural_similarity.cpp``) does all at once, for float32 on a CPU where it was built; elsewhere
+torch blurs them together, which takes about half the time of one by one. Tests check that all
+agree.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ SSIM_WINDOW = 11
 def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Tensor:
     """Mean structural similarity (Wang et al. 2004, eq. 13) of two images.
 
-    An 11 x 11 Gaussian window of sigma 1.5, population moments, and only pixels whose window lies inside the image. A
-    side shorter than the window is not blurred along, as in pytorch-msssim.
+    An 11 x 11 Gaussian window of sigma 1.5, population moments, and only pixels whose window lies
+    inside the image. A side shorter than the window is not blurred along, as in pytorch-msssim.
 
     Args:
         image: (B, C, H, W), in [0, 1].
@@ -38,13 +39,19 @@ def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Ten
         A scalar in [-1, 1]; 1 for identical images. Differentiable.
     """
     if _suited(image, other) and KERNELS.usable_for(compiled, image, other):
-        if other.requires_grad and torch.is_grad_enabled():  # it is symmetric, and the kernel's gradient by the first
+        if (
+            other.requires_grad and torch.is_grad_enabled()
+        ):  # it is symmetric, and the kernel's gradient by the first
             image, other = other, image
         return CompiledSimilarity.apply(image, other)
     maps = torch.cat([image, other, image * image, other * other, image * other], dim=1)
     mean, other_mean, square, other_square, product = _blur(maps).chunk(5, dim=1)
-    light, detail = 0.01**2, 0.03**2  # the constants of Wang et al. 2004 for a data range of 1
-    mean_product, mean_square, other_mean_square = mean * other_mean, mean * mean, other_mean * other_mean
+    # the constants of Wang et al. 2004 for a data range of 1
+    light = 0.01**2
+    detail = 0.03**2
+    mean_product = mean * other_mean
+    mean_square = mean * mean
+    other_mean_square = other_mean * other_mean
     contrast = (2 * (product - mean_product) + detail) / (
         square - mean_square + other_square - other_mean_square + detail
     )
@@ -73,7 +80,8 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _suited(image: Tensor, other: Tensor) -> bool:
-    """Whether the kernel can take images of these sizes, and a gradient by one of them at most is asked for."""
+    """Whether the kernel can take images of these sizes, and a gradient by one of them at most is
+    asked for."""
     return (
         image.dim() == 4
         and image.shape == other.shape
@@ -88,15 +96,21 @@ class CompiledSimilarity(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image, other):
-        # Where the channels of pixels lie together, as in a render, they are taken so; at most MOST_STEP of the kernel.
+        # Where the channels of pixels lie together, as in a render, they are taken so; at most
+        # MOST_STEP of the kernel.
         interleaved = image.shape[1] <= 4 and image.permute(0, 2, 3, 1).is_contiguous()
         order = (0, 2, 3, 1) if interleaved else (0, 1, 2, 3)
         image, other = (tensor.detach().permute(order).contiguous() for tensor in (image, other))
         batch, *_, side = image.shape
-        planes, height = (batch, image.shape[1]) if interleaved else (batch * image.shape[1], image.shape[2])
+        planes, height = (
+            (batch, image.shape[1]) if interleaved else (batch * image.shape[1], image.shape[2])
+        )
         step, row = (side, image.shape[2] * side) if interleaved else (1, side)
-        rows, windows = height - SSIM_WINDOW + 1, row - (SSIM_WINDOW - 1) * step
-        ctx.shape, ctx.interleaved = (planes, height, row, step, math.ceil(rows / 48)), interleaved  # rows of a band
+        rows = height - SSIM_WINDOW + 1
+        windows = row - (SSIM_WINDOW - 1) * step
+        # rows of a band
+        ctx.shape = (planes, height, row, step, math.ceil(rows / 48))
+        ctx.interleaved = interleaved
         ctx.count = planes * rows * windows
         partials = image.new_empty(3, planes, rows, windows) if ctx.needs_input_grad[0] else None
         sums = torch.empty(planes * ctx.shape[-1], **DOUBLES)
@@ -124,7 +138,16 @@ def _call(
 ) -> None:
     planes, height, row, step, bands = shape
     task = KERNELS.structs["Similarity"](
-        image=image, other=other, window=_window(image.dtype, image.device), planes=planes, height=height, row=row,
-        step=step, bands=bands, partials=partials, sums=sums, grad=grad,
-    )  # fmt: skip
+        image=image,
+        other=other,
+        window=_window(image.dtype, image.device),
+        planes=planes,
+        height=height,
+        row=row,
+        step=step,
+        bands=bands,
+        partials=partials,
+        sums=sums,
+        grad=grad,
+    )
     on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)

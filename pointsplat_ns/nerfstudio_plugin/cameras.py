@@ -1,4 +1,5 @@
-"""nerfstudio's cameras as views, views as nerfstudio's cameras, and the options of the rasterizer in both models."""
+"""nerfstudio's cameras as views, views as nerfstudio's cameras, and the options of the rasterizer
+in both models."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, RasterizeMode, Views
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
-"""Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
+"""Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in
+Splatfacto."""
 
 
 @dataclass
@@ -27,12 +29,14 @@ class RasterizerOptions:
     """Choice of the rasterizer and its speed"""
 
     backend: Literal["auto", "torch", "gsplat"] = "auto"
-    """Rasterizer: torch runs everywhere, gsplat needs CUDA, auto takes gsplat if its CUDA kernels are available."""
+    """Rasterizer: torch runs everywhere, gsplat needs CUDA, auto takes gsplat if its CUDA kernels
+    are available."""
     compiled: bool | None = None
-    """Draw with compiled kernels on a CPU: None if they were built, True warns if they were not, False leaves it to
-    torch, which is several times slower."""
+    """Draw with compiled kernels on a CPU: None if they were built, True warns if they were not,
+    False leaves it to torch, which is several times slower."""
     quality: Literal["exact", "balanced", "fast"] = "exact"
-    """Accuracy that training gives up for speed (see docs/rasterizer.md). Evaluation is always exact."""
+    """Accuracy that training gives up for speed (see docs/rasterizer.md). Evaluation is always
+    exact."""
 
     def engine(self, device: torch.device) -> str:
         """Name of the rasterizer in use, a line for the log."""
@@ -40,56 +44,71 @@ class RasterizerOptions:
             return "rasterizer: gsplat"
         if device.type != "cpu":
             return "rasterizer: torch"
-        why = "as --pipeline.model.compiled is False" if self.compiled is False else KERNELS.why_missing
+        why = (
+            "as --pipeline.model.compiled is False"
+            if self.compiled is False
+            else KERNELS.why_missing
+        )
         slow = f"torch, several times slower than compiled kernels: {why}"
         return f"rasterizer: {slow if why else 'compiled'}"
 
     def rasterize(self, training: bool, **arguments) -> tuple[Tensor, Tensor, dict]:
-        """:func:`~pointsplat_ns.rasterizer.rasterization` with these options; exact outside of training."""
+        """:func:`~pointsplat_ns.rasterizer.rasterization` with these options; exact outside of
+        training."""
         quality = self.quality if training else "exact"
-        return rasterization(**arguments, backend=self.backend, compiled=self.compiled, quality=quality)
+        return rasterization(
+            **arguments, backend=self.backend, compiled=self.compiled, quality=quality
+        )
 
 
 def cameras_of_views(views: Views) -> Cameras:
-    """Views as nerfstudio cameras (C,), float32 on the CPU, without background and rasterize mode. nerfstudio's cameras
-    have no near plane and no ``eps2d``: these go into their metadata, where :func:`carried` finds them."""
-    poses, Ks = viewmats_to_opengl(views.viewmats.double().cpu()).float(), views.Ks.float().cpu()
+    """Views as nerfstudio cameras (C,), float32 on the CPU, without background and rasterize mode.
+    nerfstudio's cameras have no near plane and no ``eps2d``: these go into their metadata, where
+    :func:`carried` finds them."""
+    poses = viewmats_to_opengl(views.viewmats.double().cpu()).float()
+    Ks = views.Ks.float().cpu()
     fx, fy, cx, cy = (Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     ours = {"near_plane": views.near_plane, "eps2d": views.eps2d}
     metadata = {name: torch.full((len(views), 1), value, **DOUBLES) for name, value in ours.items()}
     kind = CameraType.PERSPECTIVE
-    return Cameras(poses, fx, fy, cx, cy, views.width, views.height, camera_type=kind, metadata=metadata)
+    return Cameras(
+        poses, fx, fy, cx, cy, views.width, views.height, camera_type=kind, metadata=metadata
+    )
 
 
 def carried(cameras: Cameras) -> dict[str, float]:
-    """``near_plane``, in scene units, and ``eps2d``, in pixels^2, of cameras (C,); gsplat's if they do not come from
-    :func:`cameras_of_views`. Raises DataError if the cameras differ in them."""
+    """``near_plane``, in scene units, and ``eps2d``, in pixels^2, of cameras (C,); gsplat's if they
+    do not come from :func:`cameras_of_views`. Raises DataError if the cameras differ in them."""
     found = {"near_plane": NEAR_PLANE, "eps2d": EPS2D}
     for name in found:
         values = (cameras.metadata or {}).get(name)
         if values is not None and values.numel() > 0:
             different = values.unique().tolist()
             if len(different) != 1:
-                raise DataError(f"cameras of {len(different)} values of {name}; expected one for all views")
+                raise DataError(
+                    f"cameras of {len(different)} values of {name}; expected one for all views"
+                )
             (found[name],) = different
     return found
 
 
 def need_pinhole(camera: Cameras) -> None:
-    """Raise a DataError if a camera (1,) has a lens. Datasets have none; camera paths of the viewer may. The viewer
-    draws in a thread, which an error would end: there such a camera is drawn as a pinhole, as by nerfstudio's
-    Splatfacto."""
+    """Raise a DataError if a camera (1,) has a lens. Datasets have none; camera paths of the viewer
+    may. The viewer draws in a thread, which an error would end: there such a camera is drawn as a
+    pinhole, as by nerfstudio's Splatfacto."""
     kind = CameraType(int(camera.camera_type))
     if kind != CameraType.PERSPECTIVE and threading.current_thread() is threading.main_thread():
         raise DataError(
-            f"cameras of kind {kind.name.lower()}: expected perspective ones; choose Perspective in the render tab of "
-            "the viewer, or change camera_type in the camera path"
+            f"cameras of kind {kind.name.lower()}: expected perspective ones; choose Perspective "
+            "in the render tab of the viewer, or change camera_type in the camera path"
         )
 
 
-def views_of_cameras(cameras: Cameras, background: Tensor, rasterize_mode: RasterizeMode = "classic") -> Views:
-    """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored. Raises DataError if the
-    cameras have images of several sizes, or differ in near plane or ``eps2d``."""
+def views_of_cameras(
+    cameras: Cameras, background: Tensor, rasterize_mode: RasterizeMode = "classic"
+) -> Views:
+    """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored. Raises
+    DataError if the cameras have images of several sizes, or differ in near plane or ``eps2d``."""
     sizes = {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)}
     if len(sizes) != 1:
         raise DataError(f"photos of {len(sizes)} sizes; expected one size for all views")

@@ -1,7 +1,7 @@
 """A nerfstudio datamanager that reads each photo when a step needs it.
 
-nerfstudio's own full-image datamanager decodes every photo at the first step and keeps all of them. Above 500 photos it
-pins their memory, which raises without CUDA.
+nerfstudio's own full-image datamanager decodes every photo at the first step and keeps all of them.
+Above 500 photos it pins their memory, which raises without CUDA.
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import (
+    FullImageDatamanager,
+    FullImageDatamanagerConfig,
+)
 
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, UndistortedDataset
 
@@ -24,13 +27,16 @@ class LazyImageDatamanagerConfig(FullImageDatamanagerConfig):
     cache_images: Literal["cpu", "gpu"] = "cpu"
     """Has no effect here: decoded photos stay in main memory, within cache_gigabytes."""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
-    """Type of the images in the cache and of those returned; uint8 takes a quarter of the memory."""
+    """Type of the images in the cache and of those returned; uint8 takes a quarter of the
+    memory."""
     cache_gigabytes: float | None = None
-    """Memory for decoded photos; by default a quarter of the free memory. Photos that do not fit are read again."""
+    """Memory for decoded photos; by default a quarter of the free memory. Photos that do not fit
+    are read again."""
 
 
 class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
-    """Full images, undistorted, and pinhole cameras, in the order of nerfstudio's datamanager for the same seed."""
+    """Full images, undistorted, and pinhole cameras, in the order of nerfstudio's datamanager for
+    the same seed."""
 
     config: LazyImageDatamanagerConfig
     latest_photo: str = ""
@@ -44,12 +50,16 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
     @cached_property
     def train_frames(self) -> Frames:
         """Training photos by index."""
-        return Frames(self.train_dataset, self.config.cache_images_type, self.frame_cache, self.device)
+        return Frames(
+            self.train_dataset, self.config.cache_images_type, self.frame_cache, self.device
+        )
 
     @cached_property
     def fixed_indices_eval_dataloader(self) -> Frames:  # type: ignore[override]  # nerfstudio's is a list
         """Held-out photos by index."""
-        return Frames(self.eval_dataset, self.config.cache_images_type, self.frame_cache, self.device)
+        return Frames(
+            self.eval_dataset, self.config.cache_images_type, self.frame_cache, self.device
+        )
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a training photo (the first one's, if they differ)."""

@@ -21,15 +21,18 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
 
-def dataset_views(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Views:
-    """The poses of a Splatfacto run's dataset, in the frame and at the resolution that it was trained in; those of
-    training photos as the training corrected them.
+def dataset_views(
+    path: Path | str, split: Split = "train", data: Path | str | None = None
+) -> Views:
+    """The poses of a Splatfacto run's dataset, in the frame and at the resolution that it was
+    trained in; those of training photos as the training corrected them.
 
     Needs nerfstudio, which takes a few seconds to import.
 
     Args:
         path: the run's folder, ``config.yml`` or checkpoint.
-        split: "train" for the poses of the training photos, "test" for those of the held-out photos.
+        split: "train" for the poses of the training photos, "test" for those of the held-out
+            photos.
         data: where the run's data is now, if it moved: the data itself, or a folder above it.
 
     Returns:
@@ -44,7 +47,8 @@ def dataset_views(path: Path | str, split: Split = "train", data: Path | str | N
         >>> ps.dataset_views("outputs/no_run")
         Traceback (most recent call last):
         ...
-        pointsplat_ns.errors.SceneError: outputs/no_run: no such file or folder; expected a nerfstudio run
+        pointsplat_ns.errors.SceneError: outputs/no_run: no such file or folder; expected a
+        nerfstudio run
     """
     return _scene_at(path, data).views(split)
 
@@ -57,14 +61,17 @@ def view_source(
     resolution: tuple[int, int] | None = None,
     up: Up | None = None,
 ) -> ViewSource:
-    """The source of a scene's views: given ones, those of a run's dataset, else sampled ones; arguments as of
-    :class:`~pointsplat_ns.view_source.ViewSource` and :func:`dataset_views`."""
-    return ViewSource(scene, given, run, functools.partial(dataset_views, data=data), resolution, up)
+    """The source of a scene's views: given ones, those of a run's dataset, else sampled ones;
+    arguments as of :class:`~pointsplat_ns.view_source.ViewSource` and :func:`dataset_views`."""
+    return ViewSource(
+        scene, given, run, functools.partial(dataset_views, data=data), resolution, up
+    )
 
 
 def run_photos(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Photos:
-    """The photos of a split of a run's dataset, read when they are asked for. Arguments and errors are those of
-    :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
+    """The photos of a split of a run's dataset, read when they are asked for. Arguments and errors
+    are those of :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked
+    for."""
     scene = _scene_at(path, data)
     if split == "train":
         scene.need_photos_as_rendered("leave the photos out")
@@ -72,14 +79,16 @@ def run_photos(path: Path | str, split: Split = "train", data: Path | str | None
 
 
 def need_named_data(scene: object, data: Path | str | None) -> None:
-    """If the data of a run is named, check that it serves: a PointSplatError if ``scene`` is no path of a run, the
-    poses cannot be read there, or photos are not like renders. Where nothing is named, data that is missing is no
-    error."""
+    """If the data of a run is named, check that it serves: a PointSplatError if ``scene`` is no
+    path of a run, the poses cannot be read there, or photos are not like renders. Where nothing is
+    named, data that is missing is no error."""
     if data is None:
         return
     if not isinstance(scene, (str, Path)) or not may_be_run(scene):
         what = scene if isinstance(scene, (str, Path)) else "a scene in memory"
-        raise SceneError(f"{what}: no run, so it has no data at {data}; expected a run, or no --data")
+        raise SceneError(
+            f"{what}: no run, so it has no data at {data}; expected a run, or no --data"
+        )
     trained = _scene_at(scene, data)
     check_photos(trained.read_dense(), trained.photos("train"), data)
 

@@ -1,6 +1,8 @@
-"""Registration with nerfstudio that cannot break its commands; errors there in one line; warnings that nobody can help.
+"""Registration with nerfstudio that cannot break its commands; errors there in one line; warnings
+that nobody can help.
 
-:data:`JIT_SCRIPT` is raised before nerfstudio loads any plugin, so nothing here can silence it in a ``ns-*`` command.
+:data:`JIT_SCRIPT` is raised before nerfstudio loads any plugin, so nothing here can silence it in a
+``ns-*`` command.
 """
 
 from __future__ import annotations
@@ -15,14 +17,16 @@ from typing import Any
 from pointsplat_ns.errors import PointSplatError
 
 JIT_SCRIPT = "ignore:`torch.jit.script` is deprecated:FutureWarning:torch.jit._script"
-"""Value of the environment variable PYTHONWARNINGS that hides a warning: nerfstudio scripts a function at import."""
+"""Value of the environment variable PYTHONWARNINGS that hides a warning: nerfstudio scripts a
+function at import."""
 
 
 def load_specification(name: str, build: Callable[[], Any]) -> Any:
-    """What ``build`` returns for nerfstudio's registry, or one line that says why it could not be loaded.
+    """What ``build`` returns for nerfstudio's registry, or one line that says why it could not be
+    loaded.
 
-    nerfstudio does not guard the loading of entry points: one failing import would end every ``ns-*`` command. It does
-    skip whatever is not a specification, and prints it in a warning.
+    nerfstudio does not guard the loading of entry points: one failing import would end every
+    ``ns-*`` command. It does skip whatever is not a specification, and prints it in a warning.
     """
     try:
         return build()
@@ -31,10 +35,13 @@ def load_specification(name: str, build: Callable[[], Any]) -> Any:
 
 
 def errors_in_one_line() -> None:
-    """Print an uncaught :class:`PointSplatError` in one line, without its traceback. The exit status is 1."""
+    """Print an uncaught :class:`PointSplatError` in one line, without its traceback. The exit
+    status is 1."""
     before = sys.excepthook
 
-    def print_error(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+    def print_error(
+        kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+    ) -> None:
         if isinstance(error, PointSplatError):
             print(f"error: {error}", file=sys.stderr)
         else:
@@ -44,8 +51,8 @@ def errors_in_one_line() -> None:
 
 
 def quiet_nerfstudio() -> None:
-    """Ignore warnings that torch and Python raise for nerfstudio's own modules, from now on in this process: a user can
-    do nothing about them."""
+    """Ignore warnings that torch and Python raise for nerfstudio's own modules, from now on in this
+    process: a user can do nothing about them."""
     for category in (FutureWarning, UserWarning):
         warnings.filterwarnings("ignore", category=category, module=r"nerfstudio\.")
 
@@ -53,8 +60,9 @@ def quiet_nerfstudio() -> None:
 def import_nerfstudio() -> None:
     """Import the first modules of nerfstudio without the warnings that come with it.
 
-    nerfstudio loads plugins while it is itself only half imported; after this call its modules can be imported in any
-    order. Call it before importing any module that needs nerfstudio, in code that nerfstudio does not run itself.
+    nerfstudio loads plugins while it is itself only half imported; after this call its modules can
+    be imported in any order. Call it before importing any module that needs nerfstudio, in code
+    that nerfstudio does not run itself.
     """
     quiet_nerfstudio()
     with warnings.catch_warnings():

@@ -1,4 +1,5 @@
-"""nerfstudio dataparser for ScanNet++ (``scannetpp-seeded``): nerfstudio's own, and what splatting needs beside it."""
+"""nerfstudio dataparser for ScanNet++ (``scannetpp-seeded``): nerfstudio's own, and what splatting
+needs beside it."""
 
 from __future__ import annotations
 
@@ -22,26 +23,36 @@ from pointsplat_ns.io.files import read_text
 from pointsplat_ns.system.tensors import INDICES
 
 SOURCES = (
-    ("dslr/nerfstudio/transforms.json", "dslr/resized_images", "dslr/resized_anon_masks", "dslr/colmap"),
-    # The dataset's toolkit writes these: photos undistorted by OpenCV, or by COLMAP; frames of the iPhone's video.
     (
-        "dslr/nerfstudio/transforms_undistorted.json", "dslr/undistorted_images", "dslr/undistorted_anon_masks",
+        "dslr/nerfstudio/transforms.json",
+        "dslr/resized_images",
+        "dslr/resized_anon_masks",
+        "dslr/colmap",
+    ),
+    # The dataset's toolkit writes these: photos undistorted by OpenCV, or by COLMAP; frames of the
+    # iPhone's video.
+    (
+        "dslr/nerfstudio/transforms_undistorted.json",
+        "dslr/undistorted_images",
+        "dslr/undistorted_anon_masks",
         "dslr/colmap",
     ),
     ("nerfstudio/transforms.json", "images", "masks", "colmap"),
     ("iphone/nerfstudio/transforms.json", "iphone/rgb", "iphone/rgb_masks", "iphone/colmap"),
-)  # fmt: skip
-"""Transforms, photos, masks and COLMAP's model of all photos that a scene may have. The first whose files are there are
-used."""
+)
+"""Transforms, photos, masks and COLMAP's model of all photos that a scene may have. The first whose
+files are there are used."""
 
 
 @dataclass
 class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
-    """ScanNet++ without the frames that it marks as bad, and with COLMAP's points, from which Splatfacto starts
+    """ScanNet++ without the frames that it marks as bad, and with COLMAP's points, from which
+    Splatfacto starts
 
-    Without paths of your own, the first of these is used whose photos are there: photos of the DSLR, undistorted ones
-    of the dataset's toolkit, frames of the iPhone. Photos are held out by test_frames, else by train_test_lists.json.
-    Where there is neither, or the photos of the test are hidden, every tenth is held out.
+    Without paths of your own, the first of these is used whose photos are there: photos of the
+    DSLR, undistorted ones of the dataset's toolkit, frames of the iPhone. Photos are held out by
+    test_frames, else by train_test_lists.json. Where there is neither, or the photos of the test
+    are hidden, every tenth is held out.
     """
 
     _target: type = field(default_factory=lambda: SeededScanNetpp)
@@ -52,20 +63,24 @@ class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
     colmap_path: Path = Path(SOURCES[0][-1])
     """Relative path to COLMAP's images and points3D, as text or binary files."""
     train_split_fraction: float | None = None
-    """Train on this share of all photos and hold out the others, evenly spread, whatever the lists say."""
+    """Train on this share of all photos and hold out the others, evenly spread, whatever the lists
+    say."""
 
 
 @dataclass
 class SeededScanNetpp(ScanNetpp):
-    """nerfstudio's ScanNet++ dataparser, which needs test_frames and all photos, uses bad frames and gives no seed
-    points. Bad and hidden frames count in the orientation, centre and scale of all poses, as there."""
+    """nerfstudio's ScanNet++ dataparser, which needs test_frames and all photos, uses bad frames
+    and gives no seed points. Bad and hidden frames count in the orientation, centre and scale of
+    all poses, as there."""
 
     config: SeededScanNetppDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:  # type: ignore[override]
-        """See the base class. ``split`` is "train", or "val" or "test" for the photos that are held out. Raises
-        DataError if the transforms file or COLMAP's files cannot be used, or photos are missing."""
-        given, located = self.config, _located(self.config)
+        """See the base class. ``split`` is "train", or "val" or "test" for the photos that are held
+        out. Raises DataError if the transforms file or COLMAP's files cannot be used, or photos are
+        missing."""
+        given = self.config
+        located = _located(self.config)
         photos = located.data / located.images_dir
         meta, hidden = _split(located)
         frames = {frame["file_path"]: frame for frame in (*meta["frames"], *meta["test_frames"])}
@@ -77,20 +92,22 @@ class SeededScanNetpp(ScanNetpp):
                 outputs = super()._generate_dataparser_outputs(split)
         finally:
             self.config = given
-        bad = {name for name, frame in frames.items() if self.config.skip_bad and frame.get("is_bad")}
+        bad = {
+            name for name, frame in frames.items() if self.config.skip_bad and frame.get("is_bad")
+        }
         names = [str(path.relative_to(photos)) for path in outputs.image_filenames]
         kept = [i for i, name in enumerate(names) if name not in hidden | bad]
         if len(kept) < len(names):
             where = f"{located.data / located.transforms_path}: {split} split"
             if not kept:
                 raise DataError(
-                    f"{where}: all {len(names)} frames are hidden or marked is_bad; expected one that is not; "
-                    "--skip-bad False takes bad ones"
+                    f"{where}: all {len(names)} frames are hidden or marked is_bad; expected one "
+                    "that is not; --skip-bad False takes bad ones"
                 )
             missing = sum(name in hidden for name in names)
             CONSOLE.log(
-                f"{where}: of {len(names)} frames {len(names) - len(kept) - missing} that are marked is_bad and "
-                f"{missing} that are hidden are left out"
+                f"{where}: of {len(names)} frames {len(names) - len(kept) - missing} that are "
+                f"marked is_bad and {missing} that are hidden are left out"
             )
             outputs.image_filenames = [outputs.image_filenames[i] for i in kept]
             if outputs.mask_filenames is not None:
@@ -102,17 +119,26 @@ class SeededScanNetpp(ScanNetpp):
             if not points:
                 CONSOLE.log(f"{model}: no points of COLMAP, so no seed points")
                 return outputs
-            poses = {name: np.array(frame["transform_matrix"], dtype=np.float64) for name, frame in frames.items()}
-            move, transform = _frame_of(model, poses), outputs.dataparser_transform.double()
-            xyz = torch.from_numpy(np.array([point.xyz for point in points]) @ move[:3, :3].T + move[:3, 3])
+            poses = {
+                name: np.array(frame["transform_matrix"], dtype=np.float64)
+                for name, frame in frames.items()
+            }
+            move = _frame_of(model, poses)
+            transform = outputs.dataparser_transform.double()
+            xyz = torch.from_numpy(
+                np.array([point.xyz for point in points]) @ move[:3, :3].T + move[:3, 3]
+            )
             placed = (xyz @ transform[:, :3].T + transform[:, 3]) * outputs.dataparser_scale
             outputs.metadata["points3D_xyz"] = placed.float()
-            outputs.metadata["points3D_rgb"] = torch.from_numpy(np.array([p.rgb for p in points], dtype=np.uint8))
+            outputs.metadata["points3D_rgb"] = torch.from_numpy(
+                np.array([p.rgb for p in points], dtype=np.uint8)
+            )
         return outputs
 
 
 def _located(config: SeededScanNetppDataParserConfig) -> SeededScanNetppDataParserConfig:
-    """The config with the paths of the first source whose photos are there, unless one of its paths was given."""
+    """The config with the paths of the first source whose photos are there, unless one of its paths
+    was given."""
     names = ("transforms_path", "images_dir", "masks_dir", "colmap_path")
     if tuple(map(Path, SOURCES[0])) == tuple(Path(getattr(config, name)) for name in names):
         for paths in SOURCES:
@@ -123,27 +149,39 @@ def _located(config: SeededScanNetppDataParserConfig) -> SeededScanNetppDataPars
 
 
 def _split(config: SeededScanNetppDataParserConfig) -> tuple[dict[str, Any], set[str]]:
-    """The content of the transforms file with all photos either in ``frames`` or in ``test_frames``; and the names of
-    hidden photos, those of official tests. Raises DataError if the file, or a training photo, cannot be used."""
-    path, photos = config.data / config.transforms_path, config.data / config.images_dir
+    """The content of the transforms file with all photos either in ``frames`` or in
+    ``test_frames``; and the names of hidden photos, those of official tests. Raises DataError if
+    the file, or a training photo, cannot be used."""
+    path = config.data / config.transforms_path
+    photos = config.data / config.images_dir
     listed_in = path.parent.parent / "train_test_lists.json"
     expected = "expected JSON with frames, as ScanNet++ has it"
     try:
         meta = json.loads(read_text(path, 1 << 28))
-        test, frames = [dict(frame) for frame in meta.get("test_frames") or []], [dict(each) for each in meta["frames"]]
+        test = [dict(frame) for frame in meta.get("test_frames") or []]
+        frames = [dict(each) for each in meta["frames"]]
         for frame in (*frames, *test):
             frame["file_path"] = _below(photos, frame["file_path"])
-        listed = set() if test or not listed_in.is_file() else set(json.loads(read_text(listed_in, 1 << 26))["test"])
+        listed = (
+            set()
+            if test or not listed_in.is_file()
+            else set(json.loads(read_text(listed_in, 1 << 26))["test"])
+        )
     except FileNotFoundError as error:
-        raise DataError(f"{path}: no such file; {expected}; --data names the scene's folder") from error
+        raise DataError(
+            f"{path}: no such file; {expected}; --data names the scene's folder"
+        ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: {type(error).__name__}: {error}; {expected}") from error
     test += [frame for frame in frames if frame["file_path"] in listed]
     frames = [frame for frame in frames if frame["file_path"] not in listed]
-    missing = [frame["file_path"] for frame in frames if not (photos / frame["file_path"]).is_file()]
+    missing = [
+        frame["file_path"] for frame in frames if not (photos / frame["file_path"]).is_file()
+    ]
     if missing:
         raise DataError(
-            f"{photos}: {len(missing)} of {len(frames)} training photos are missing, first {missing[0]}; expected all "
+            f"{photos}: {len(missing)} of {len(frames)} training photos are missing, first "
+            f"{missing[0]}; expected all "
             f"frames of {path.name}; download them, or name their folder by --images-dir"
         )
     shown = [frame for frame in test if (photos / frame["file_path"]).is_file()]
@@ -152,15 +190,21 @@ def _split(config: SeededScanNetppDataParserConfig) -> tuple[dict[str, Any], set
     if fraction is None and not shown:
         why = "the photos of the test are hidden" if hidden else "no photos are named for a test"
         CONSOLE.log(f"{path}: {why}, so every tenth training photo is held out")
-        fraction = min(0.9, (len(frames) - 1.5) / len(frames)) if len(frames) > 1 else 0.9  # of few photos one
+        fraction = (
+            min(0.9, (len(frames) - 1.5) / len(frames)) if len(frames) > 1 else 0.9
+        )  # of few photos one
     if fraction is not None:
         if not 0 < fraction < 1:
             raise DataError(f"--train-split-fraction {fraction}: expected above 0 and below 1")
         every = sorted([*frames, *shown], key=lambda frame: frame["file_path"])
-        train, held_out = get_train_eval_split_fraction([frame["file_path"] for frame in every], fraction)
+        train, held_out = get_train_eval_split_fraction(
+            [frame["file_path"] for frame in every], fraction
+        )
         if len(held_out) == 0:
             raise DataError(f"{path}: {len(every)} photos; expected enough to hold out one of them")
-        test = [every[i] for i in held_out] + [frame for frame in test if frame["file_path"] in hidden]
+        test = [every[i] for i in held_out] + [
+            frame for frame in test if frame["file_path"] in hidden
+        ]
         frames = [every[i] for i in train]
     return {**meta, "frames": frames, "test_frames": test}, hidden
 
@@ -172,15 +216,18 @@ def _below(photos: Path, name: str) -> str:
 
 
 def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:
-    """The rigid motion (4, 4) from COLMAP's frame to that of ``poses``: camera-to-world (4, 4) in OpenGL axes, by the
-    name of the photo. Raises DataError if they know no photo in common, or no motion takes the ones to the others."""
+    """The rigid motion (4, 4) from COLMAP's frame to that of ``poses``: camera-to-world (4, 4) in
+    OpenGL axes, by the name of the photo. Raises DataError if they know no photo in common, or no
+    motion takes the ones to the others."""
     from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
-    ours, theirs = [], []
+    ours = []
+    theirs = []
     for image in _read(folder, "images").values():
         if image.name in poses:
             viewmat = np.eye(4)
-            viewmat[:3, :3], viewmat[:3, 3] = qvec2rotmat(image.qvec), image.tvec
+            viewmat[:3, :3] = qvec2rotmat(image.qvec)
+            viewmat[:3, 3] = image.tvec
             theirs.append(flip_camera_axes(torch.from_numpy(np.linalg.inv(viewmat))).numpy())
             ours.append(poses[image.name])
     advice = "give the COLMAP model that the poses come from, or --load-seed-points False"
@@ -190,11 +237,13 @@ def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:
     differences = np.abs(move @ np.stack(theirs) - np.stack(ours))
     centers = np.stack(ours)[:, :3, 3]
     apart = max(float(np.ptp(centers, axis=0).max()), 1e-9)
-    worst = max(differences[:, :3, :3].max(), differences[:, :3, 3].max() / apart if len(ours) > 1 else 0.0)
+    worst = max(
+        differences[:, :3, :3].max(), differences[:, :3, 3].max() / apart if len(ours) > 1 else 0.0
+    )
     if not worst <= 1e-3:  # NaN fails too; transforms.json has six decimals
         raise DataError(
-            f"{folder}: COLMAP's poses of {len(ours)} photos are not those of transforms.json, moved as a whole (they "
-            f"differ by {worst:.2g}); {advice}"
+            f"{folder}: COLMAP's poses of {len(ours)} photos are not those of transforms.json, "
+            f"moved as a whole (they differ by {worst:.2g}); {advice}"
         )
     return move
 
@@ -209,5 +258,10 @@ def _read(folder: Path, name: str) -> dict[int, Any]:
             try:
                 return getattr(colmap, f"read_{name}_{kind}")(path)
             except Exception as error:  # these readers check nothing
-                raise DataError(f"{path}: cannot be read as COLMAP's: {type(error).__name__}: {error}") from error
-    raise DataError(f"{folder}: no {name}.bin or {name}.txt; expected COLMAP's; or give --load-seed-points False")
+                raise DataError(
+                    f"{path}: cannot be read as COLMAP's: {type(error).__name__}: {error}"
+                ) from error
+    raise DataError(
+        f"{folder}: no {name}.bin or {name}.txt; expected COLMAP's; or give --load-seed-points "
+        "False"
+    )

@@ -1,4 +1,5 @@
-"""The trainer of both methods: nerfstudio's, which can be stopped at any time and skips steps that are not finite."""
+"""The trainer of both methods: nerfstudio's, which can be stopped at any time and skips steps that
+are not finite."""
 
 from __future__ import annotations
 
@@ -32,10 +33,12 @@ from pointsplat_ns.system.memory import keep_freed_memory
 from pointsplat_ns.system.threads import fixed_threads, one_thread_each
 
 STATE = "pointsplat"
-"""Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
+"""Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio
+ignores it."""
 
 MOST_SKIPPED_IN_A_ROW = 10
-"""Number of steps in a row that may be skipped, before training stops and names their photos or scenes."""
+"""Number of steps in a row that may be skipped, before training stops and names their photos or
+scenes."""
 
 
 @dataclass
@@ -43,8 +46,9 @@ class StoppableTrainerConfig(TrainerConfig):
     """nerfstudio's trainer config, with the number of threads"""
 
     threads: int | None = None
-    """Number of threads of a training on a CPU. By default as many as other programs leave cores; the environment
-    variable OMP_NUM_THREADS has the same effect as this. Another number may change results by rounding."""
+    """Number of threads of a training on a CPU. By default as many as other programs leave cores;
+    the environment variable OMP_NUM_THREADS has the same effect as this. Another number may change
+    results by rounding."""
 
     # Settings of nerfstudio's that have no effect here: hidden on the command line.
     mixed_precision: Suppress[Fixed[bool]] = False
@@ -53,12 +57,12 @@ class StoppableTrainerConfig(TrainerConfig):
     log_gradients: Suppress[Fixed[bool]] = False
 
     def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all. Raises PointSplatError if it cannot be written, or no step is asked
-        for."""
+        """As nerfstudio's, but whole or not at all. Raises PointSplatError if it cannot be written,
+        or no step is asked for."""
         if self.max_num_iterations < 1:
             raise PointSplatError(
-                f"--max-num-iterations {self.max_num_iterations}: expected at least 1; a run is shown and measured "
-                "without a training by ns-viewer, ns-render and ns-eval"
+                f"--max-num-iterations {self.max_num_iterations}: expected at least 1; a run is "
+                "shown and measured without a training by ns-viewer, ns-render and ns-eval"
             )
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
@@ -66,22 +70,30 @@ class StoppableTrainerConfig(TrainerConfig):
             part.write_text(yaml.dump(self), "utf-8")
 
     def first_step(self) -> int:
-        """The step that a training begins with: 0, or the step in the name of the checkpoint that it resumes from."""
+        """The step that a training begins with: 0, or the step in the name of the checkpoint that
+        it resumes from."""
         if self.load_dir is not None and self.load_step is not None:
             return self.load_step + 1
-        paths = [self.load_checkpoint] if self.load_dir is None else self.load_dir.glob("step-*.ckpt")
-        return max((step + 1 for path in paths if path and (step := step_of(path)) is not None), default=0)
+        paths = (
+            [self.load_checkpoint] if self.load_dir is None else self.load_dir.glob("step-*.ckpt")
+        )
+        return max(
+            (step + 1 for path in paths if path and (step := step_of(path)) is not None), default=0
+        )
 
 
 class StoppableTrainer(Trainer):
-    """nerfstudio's trainer. On a CPU it reuses freed memory, and takes as many threads as other programs leave cores.
+    """nerfstudio's trainer. On a CPU it reuses freed memory, and takes as many threads as other
+    programs leave cores.
 
-    Checkpoints and the config are written beside and renamed, so that one that is there is whole. Ctrl-C and SIGTERM
-    end it after the step at hand, with a checkpoint of that step, and with the status of an interrupted program: in the
-    middle of densification, parameters are of different numbers. A second one ends it at once.
+    Checkpoints and the config are written beside and renamed, so that one that is there is whole.
+    Ctrl-C and SIGTERM end it after the step at hand, with a checkpoint of that step, and with the
+    status of an interrupted program: in the middle of densification, parameters are of different
+    numbers. A second one ends it at once.
 
-    A step whose loss or gradients are not finite, in any process, changes neither parameters nor the optimisers' state
-    nor buffers. It is counted, and the log names its photo or scene. The learning-rate schedules still advance.
+    A step whose loss or gradients are not finite, in any process, changes neither parameters nor
+    the optimisers' state nor buffers. It is counted, and the log names its photo or scene. The
+    learning-rate schedules still advance.
     """
 
     config: StoppableTrainerConfig
@@ -108,12 +120,13 @@ class StoppableTrainer(Trainer):
         except KeyboardInterrupt:
             _interrupted(signal.SIGINT)
         if self.local_rank == 0:
-            # nerfstudio takes the steps of this call for the last step, also where a training resumes from a later one.
+            # nerfstudio takes the steps of this call for the last step, also where a training
+            # resumes from a later one.
             writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
 
     def train(self) -> None:
-        """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130. nerfstudio saves none
-        and ends with 0, as if it had finished."""
+        """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130.
+        nerfstudio saves none and ends with 0, as if it had finished."""
         with fixed_threads(self.config.threads), self._signals_noted():
             try:
                 super().train()
@@ -121,21 +134,22 @@ class StoppableTrainer(Trainer):
                 if self._between_steps and self.step > self._start_step:
                     self.save_checkpoint(self.step - 1)
                     CONSOLE.log(
-                        f"Saved after step {self.step - 1}. The run is usable as it is; to go on: --load-dir "
-                        f"{self.checkpoint_dir}"
+                        f"Saved after step {self.step - 1}. The run is usable as it is; to go on: "
+                        f"--load-dir {self.checkpoint_dir}"
                     )
                 _interrupted(self._asked or signal.SIGINT)
 
     def _train_complete_viewer(self) -> None:
-        """Keep the viewer open after the last step until Ctrl-C or SIGTERM, once: the training is complete."""
+        """Keep the viewer open after the last step until Ctrl-C or SIGTERM, once: the training is
+        complete."""
         with suppress(KeyboardInterrupt):
             if self._asked is None:
                 super()._train_complete_viewer()
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """The loss, its parts, and numbers for the log, as nerfstudio's, which cannot skip a step. Raises DataError
-        after more than :data:`MOST_SKIPPED_IN_A_ROW` skipped steps, and KeyboardInterrupt if the training was asked to
-        stop."""
+        """The loss, its parts, and numbers for the log, as nerfstudio's, which cannot skip a step.
+        Raises DataError after more than :data:`MOST_SKIPPED_IN_A_ROW` skipped steps, and
+        KeyboardInterrupt if the training was asked to stop."""
         if self._asked is not None:
             self._between_steps = True
             raise KeyboardInterrupt
@@ -144,11 +158,19 @@ class StoppableTrainer(Trainer):
             self.optimizers.zero_grad_all()
             _, losses, metrics = self.pipeline.get_train_loss_dict(step=step)
             loss = functools.reduce(torch.add, losses.values())
-            faults = [f"the loss {name} is {value.item():g}" for name, value in losses.items() if not value.isfinite()]
+            faults = [
+                f"the loss {name} is {value.item():g}"
+                for name, value in losses.items()
+                if not value.isfinite()
+            ]
             skip = processes.any_rank(bool(faults), self.device)
             if not skip:
                 loss.backward()
-                bad = [name for name in self.optimizers.optimizers if not all_finite(self._trained(name))]
+                bad = [
+                    name
+                    for name in self.optimizers.optimizers
+                    if not all_finite(self._trained(name))
+                ]
                 faults = [f"the gradient of the {name} is not finite" for name in bad]
                 skip = processes.any_rank(bool(faults), self.device)
             if skip:
@@ -161,16 +183,20 @@ class StoppableTrainer(Trainer):
             self._skipped_in_a_row = self._skipped_in_a_row + 1 if skip else 0
             if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
                 self.save_checkpoint(step)
-                sources = ", ".join(f"{name}: {count}" for name, count in self.skipped.most_common(5))
+                sources = ", ".join(
+                    f"{name}: {count}" for name, count in self.skipped.most_common(5)
+                )
                 raise DataError(
-                    f"training stopped at step {step}: losses or gradients were not finite in the last "
-                    f"{self._skipped_in_a_row} steps, which were skipped ({sources}); mend or leave out what is named, "
-                    f"or lower the learning rates; then go on with --load-dir {self.checkpoint_dir}"
+                    f"training stopped at step {step}: losses or gradients were not finite in the "
+                    f"last {self._skipped_in_a_row} steps, which were skipped ({sources}); mend or "
+                    "leave out what is named, or lower the learning rates; then go on with "
+                    f"--load-dir {self.checkpoint_dir}"
                 )
             return loss, losses, {**metrics, "skipped_steps": self.skipped.total()}
 
     def update(self, step: int, skipped: bool) -> None:
-        """Step the optimisers, by gradients averaged over processes, unless the step is skipped; and all schedules."""
+        """Step the optimisers, by gradients averaged over processes, unless the step is skipped;
+        and all schedules."""
         if not skipped:
             for name in self.optimizers.optimizers:
                 processes.average_gradients(self._trained(name))
@@ -179,11 +205,14 @@ class StoppableTrainer(Trainer):
         self.optimizers.scheduler_step_all(step)
 
     def clip(self) -> None:
-        """Limit all gradients together, before each optimiser limits its own; by default they are left alone."""
+        """Limit all gradients together, before each optimiser limits its own; by default they are
+        left alone."""
 
     def _trained(self, group: str) -> list[nn.Parameter]:
         """Parameters of a group: its optimiser has them, also where densification renews them."""
-        return [p for part in self.optimizers.optimizers[group].param_groups for p in part["params"]]
+        return [
+            p for part in self.optimizers.optimizers[group].param_groups for p in part["params"]
+        ]
 
     def source_of(self, metrics: dict[str, Any]) -> str:
         """Name of the photo or scene of the latest step."""
@@ -198,14 +227,21 @@ class StoppableTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """As nerfstudio's, but a checkpoint is whole before it is there, and holds :meth:`state_to_resume`. If it
-        cannot be written, as on a full disk, older ones are left alone, and a SceneError says so."""
+        """As nerfstudio's, but a checkpoint is whole before it is there, and holds
+        :meth:`state_to_resume`. If it cannot be written, as on a full disk, older ones are left
+        alone, and a SceneError says so."""
         pipeline = getattr(self.pipeline, "module", self.pipeline)
         content: dict[str, Any] = {
             "step": step,
             "pipeline": pipeline.state_dict(),
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
-            "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
+            "optimizers": {
+                name: optimizer.state_dict()
+                for name, optimizer in self.optimizers.optimizers.items()
+            },
+            "schedulers": {
+                name: scheduler.state_dict()
+                for name, scheduler in self.optimizers.schedulers.items()
+            },
             "scalers": self.grad_scaler.state_dict(),
         }
         if state := self.state_to_resume():
@@ -228,11 +264,15 @@ class StoppableTrainer(Trainer):
 
     @contextmanager
     def _signals_noted(self) -> Iterator[None]:
-        """While this is open, signals that would end the program end the training after its step. Not where several
-        processes train together: they save together, and one of them cannot stop alone."""
+        """While this is open, signals that would end the program end the training after its step.
+        Not where several processes train together: they save together, and one of them cannot stop
+        alone."""
         before = {}
         if threading.current_thread() is threading.main_thread() and self.world_size == 1:
-            for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+            for number, usual in (
+                (signal.SIGINT, signal.default_int_handler),
+                (signal.SIGTERM, signal.SIG_DFL),
+            ):
                 if signal.getsignal(number) is usual:
                     before[number] = signal.signal(number, self._note)
         try:
@@ -243,18 +283,24 @@ class StoppableTrainer(Trainer):
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal."""
-        first, self._asked = self._asked is None, self._asked or number
+        first = self._asked is None
+        self._asked = self._asked or number
         self._between_steps = self.training_state == "paused"
         if not first or self.training_state != "training":
             raise KeyboardInterrupt
-        print("stopping after this step; once more to stop at once, without saving it", file=sys.stderr)
+        print(
+            "stopping after this step; once more to stop at once, without saving it",
+            file=sys.stderr,
+        )
 
 
 def all_finite(parameters: list[nn.Parameter]) -> bool:
-    """Whether all gradients are finite. A sum is not if a number is not, and is a fifth of the work; where it
-    overflows, each number is checked."""
+    """Whether all gradients are finite. A sum is not if a number is not, and is a fifth of the
+    work; where it overflows, each number is checked."""
     gradients = (p.grad for p in parameters if p.grad is not None)
-    return all(bool(gradient.sum().isfinite()) or bool(gradient.isfinite().all()) for gradient in gradients)
+    return all(
+        bool(gradient.sum().isfinite()) or bool(gradient.isfinite().all()) for gradient in gradients
+    )
 
 
 def _interrupted(number: int) -> NoReturn:

@@ -1,1 +1,2 @@
-"""HTML pages in one file each, which open offline: templates, scripts, pictures and security policy."""
+"""HTML pages in one file each, which open offline: templates, scripts, pictures and security
+policy."""

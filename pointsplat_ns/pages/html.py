@@ -26,20 +26,28 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     # Browsers refuse JSON with NaN or infinity.
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "ensure_ascii": False, "separators": (",", ":")}
+    environment.policies["json.dumps_kwargs"] = {
+        "allow_nan": False,
+        "ensure_ascii": False,
+        "separators": (",", ":"),
+    }
     return environment
 
 
-def page(template: str, scripts: Sequence[str] = (), allowed: Sequence[str] = (), **values: Any) -> bytes:
-    """One HTML page, as UTF-8, with its style, scripts and data in it, from a template that extends ``base.html``.
+def page(
+    template: str, scripts: Sequence[str] = (), allowed: Sequence[str] = (), **values: Any
+) -> bytes:
+    """One HTML page, as UTF-8, with its style, scripts and data in it, from a template that extends
+    ``base.html``.
 
-    Its content security policy allows the script and style with the page's hashes and embedded pictures, and no other
-    resource. So a text without escaping could run no code.
+    Its content security policy allows the script and style with the page's hashes and embedded
+    pictures, and no other resource. So a text without escaping could run no code.
 
     Args:
         scripts: names of the scripts, in their order in the page.
         allowed: further rules of the policy, such as ``worker-src blob:`` for workers.
-        values: variables of the template. Texts are escaped; undecodable bytes of file names become "?".
+        values: variables of the template. Texts are escaped; undecodable bytes of file names become
+            "?".
 
     Raises:
         ValueError: if a number for a script is NaN or infinite.
@@ -70,7 +78,8 @@ def _source(name: str) -> str:
 
 
 def _unescaped(text: str) -> Markup:
-    """A style or script of this package, without escaping: browsers do not decode entities in these elements."""
+    """A style or script of this package, without escaping: browsers do not decode entities in these
+    elements."""
     from markupsafe import Markup
 
     assert not re.search(r"</s|<!--", text), "would end its element"
@@ -79,4 +88,6 @@ def _unescaped(text: str) -> Markup:
 
 def _hash(text: str) -> str:
     """The hash of an inline script or style for a content security policy."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode(
+        "ascii"
+    )

@@ -34,8 +34,8 @@ class MergingStopped(Exception):
 
 
 class ViewedScene:
-    """A scene for the viewer, at any share of its Gaussians, for several pages, whose requests have threads of their
-    own. Merging is to the count of ``pointsplat prune``, which gives its scene.
+    """A scene for the viewer, at any share of its Gaussians, for several pages, whose requests have
+    threads of their own. Merging is to the count of ``pointsplat prune``, which gives its scene.
 
     Undrawable Gaussians are left out; raises SceneError if nothing is left.
 
@@ -44,19 +44,29 @@ class ViewedScene:
         path: of the scene; None if it has none.
         scene: N Gaussians.
         source: source of views; merging uses those of its dataset.
-        there: smaller scenes that exist already, such as levels of a stream; each stands for shares near its count.
+        there: smaller scenes that exist already, such as levels of a stream; each stands for shares
+            near its count.
     """
 
     def __init__(
-        self, name: str, path: Path | None, scene: Gaussians, source: ViewSource, there: Sequence[Gaussians] = ()
+        self,
+        name: str,
+        path: Path | None,
+        scene: Gaussians,
+        source: ViewSource,
+        there: Sequence[Gaussians] = (),
     ):
         need_usable(scene)
-        self.name, self.path, self.source = name, path, source
+        self.name = name
+        self.path = path
+        self.source = source
         self.scene = keep_usable(scene, name)
         """All drawable Gaussians."""
         self.whole = Level(self.scene, "all")
         """The level of 100 %."""
-        self._there = [Level(level, f"level {n} of the stream") for n, level in enumerate(there, start=1)]
+        self._there = [
+            Level(level, f"level {n} of the stream") for n, level in enumerate(there, start=1)
+        ]
         self._chosen: tuple[int, Level] = (100, self.whole)
         """The newest share that was chosen by coverage."""
         self._merged: dict[int, Level] = {}
@@ -76,8 +86,8 @@ class ViewedScene:
         self._choices += 1
 
     def merged(self, percent: int) -> Level | None:
-        """The level of a share that needs no more merging, after merging if there is none; None if that was
-        stopped."""
+        """The level of a share that needs no more merging, after merging if there is none; None if
+        that was stopped."""
         with self._merging:
             if (found := self.ready(percent)) is not None:
                 return found
@@ -95,7 +105,8 @@ class ViewedScene:
             except (PointSplatError, MemoryError, RuntimeError) as error:
                 how = f"chosen by coverage, because merging failed: {one_line(error)}"
                 level = Level(self._by_coverage(percent), how)
-            # Older ones are kept as long as all together have no more Gaussians than the scene itself.
+            # Older ones are kept as long as all together have no more Gaussians than the scene
+            # itself.
             kept = sum(len(older.scene) for older in self._merged.values())
             while self._merged and kept + len(level.scene) > len(self.scene):
                 kept -= len(self._merged.pop(next(iter(self._merged))).scene)
@@ -103,15 +114,19 @@ class ViewedScene:
             return level
 
     def ready(self, percent: int) -> Level | None:
-        """The level of a share that needs no merging any more: of a stream, merged, or all; None if there is none."""
+        """The level of a share that needs no merging any more: of a stream, merged, or all; None if
+        there is none."""
         if percent == 100:
             return self.whole
         count = len(self.scene) * percent / 100
         near = [level for level in self._there if abs(len(level.scene) - count) <= 0.1 * count]
-        return min(near, key=lambda level: abs(len(level.scene) - count), default=self._merged.get(percent))
+        return min(
+            near, key=lambda level: abs(len(level.scene) - count), default=self._merged.get(percent)
+        )
 
     def close(self, timeout: float) -> None:
-        """Stop merging, and wait for it at most ``timeout`` seconds; nothing is merged afterwards."""
+        """Stop merging, and wait for it at most ``timeout`` seconds; nothing is merged
+        afterwards."""
         self.stop()
         self._merging.acquire(timeout=timeout)
 

@@ -18,8 +18,8 @@ def to_uint8(picture: Tensor) -> np.ndarray:
 
 
 def with_labels(pixels: np.ndarray, labels: Sequence[str]) -> np.ndarray:
-    """A picture (H, W, 3) uint8 of two halves with their labels on dark ground, at the top left and the top right,
-    shortened to a half."""
+    """A picture (H, W, 3) uint8 of two halves with their labels on dark ground, at the top left and
+    the top right, shortened to a half."""
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
@@ -28,7 +28,9 @@ def with_labels(pixels: np.ndarray, labels: Sequence[str]) -> np.ndarray:
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image, "RGBA")
     # This font has the letters of most languages; Pillow's has Latin ones only.
-    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+    font = ImageFont.truetype(
+        str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size
+    )
     pad = size // 2
     for index, label in enumerate(labels):
         text = whole = " ".join(label.split())
@@ -39,14 +41,16 @@ def with_labels(pixels: np.ndarray, labels: Sequence[str]) -> np.ndarray:
             continue
         long = int(font.getlength(text))
         left = pad if index == 0 else width - long - 3 * pad
-        draw.rectangle((left, pad, left + long + 2 * pad, 2 * pad + size + pad // 2), fill=(0, 0, 0, 150))
+        draw.rectangle(
+            (left, pad, left + long + 2 * pad, 2 * pad + size + pad // 2), fill=(0, 0, 0, 150)
+        )
         draw.text((left + pad, pad + pad // 2), text, font=font, fill=(255, 255, 255, 255))
     return np.asarray(image)
 
 
 def read_png(path: Path, width: int, height: int) -> np.ndarray | None:
-    """The pixels of a PNG file, (height, width, 3) uint8; None if it is missing, not a PNG, damaged, or of another
-    size, which is checked before the pixels are read."""
+    """The pixels of a PNG file, (height, width, 3) uint8; None if it is missing, not a PNG,
+    damaged, or of another size, which is checked before the pixels are read."""
     from PIL import Image
 
     try:

@@ -28,12 +28,13 @@ def write_page(
     limit_mb: float = 60.0,
     progress: bool | Progress = False,
 ) -> Path:
-    """Write one HTML file that opens offline and shows a scene to fly through, or two with a wipe between them.
+    """Write one HTML file that opens offline and shows a scene to fly through, or two with a wipe
+    between them.
 
     The file needs no other file. A browser with WebGL 2 draws the scenes by the same formulas as
-    :func:`~pointsplat_ns.render`. Scenes are stored as SPZ in text, with a tenth to a quarter of the bytes of a PLY;
-    docs/formats.md gives the loss. Where two scenes make the file too large, the larger one is left out, with a warning
-    and a note in the page.
+    :func:`~pointsplat_ns.render`. Scenes are stored as SPZ in text, with a tenth to a quarter of
+    the bytes of a PLY; docs/formats.md gives the loss. Where two scenes make the file too large,
+    the larger one is left out, with a warning and a note in the page.
 
     Args:
         scenes: one scene, or two: the first is on the left of the wipe.
@@ -41,18 +42,21 @@ def write_page(
         names: a name for each scene; by default the title, or "left" and "right".
         title: title of the page; by default the name of the file.
         notes: lines of text for the reader.
-        views: known views for the page's buttons; by default found from the first scene. The page opens at the one
-            that shows most, or at one that shows the whole subject. Background and rasterize mode of the views apply
-            to all scenes.
-        up: the axis that is up in the scene ("z", "-y"); by default the scene's own, that of the views, or estimated.
+        views: known views for the page's buttons; by default found from the first scene. The page
+            opens at the one that shows most, or at one that shows the whole subject. Background and
+            rasterize mode of the views apply to all scenes.
+        up: the axis that is up in the scene ("z", "-y"); by default the scene's own, that of the
+            views, or estimated.
         limit_mb: maximum size of the file, in units of 10^6 bytes.
-        progress: True shows a bar; a function is called with the name of the task and its share done.
+        progress: True shows a bar; a function is called with the name of the task and its share
+            done.
 
     Returns:
         ``path``.
 
     Raises:
-        PointSplatError: if there are no scenes or more than two, names do not fit, or one scene alone is too large.
+        PointSplatError: if there are no scenes or more than two, names do not fit, or one scene
+            alone is too large.
         SceneError: if no Gaussian of a scene can be drawn, or the file cannot be written.
         DataError: if no Gaussian of the first scene is visible.
 
@@ -91,14 +95,26 @@ def write_page(
         missing = ""
         while True:
             html = page(
-                "scene.html", (*FLIGHT_SCRIPTS, "scene.js"), ("worker-src blob:",), title=title, notes=notes,
-                missing=missing, flight=frame.data(included), live=False, drops=(),
-            )  # fmt: skip
+                "scene.html",
+                (*FLIGHT_SCRIPTS, "scene.js"),
+                ("worker-src blob:",),
+                title=title,
+                notes=notes,
+                missing=missing,
+                flight=frame.data(included),
+                live=False,
+                drops=(),
+            )
             if len(html) <= 1e6 * limit_mb:
                 break
-            excess = f"the page would have {len(html) / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
+            excess = (
+                f"the page would have {len(html) / 1e6:.1f} MB, more than the {limit_mb:g} MB "
+                "allowed"
+            )
             if len(included) == 1:
-                raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")
+                raise PointSplatError(
+                    f"{path}: {excess}; expected a larger limit, or fewer Gaussians"
+                )
             largest = max(included, key=lambda scene: len(scene["spz"]))
             included.remove(largest)
             missing = f"{largest['name']} is left out: with it {excess}"

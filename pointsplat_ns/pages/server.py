@@ -1,6 +1,7 @@
 """The web server of the viewer: fixed routes, for pages that it served itself.
 
-Nothing of a request is a path. Pages of other sites, and names that resolve to this machine, are refused.
+Nothing of a request is a path. Pages of other sites, and names that resolve to this machine, are
+refused.
 """
 
 from __future__ import annotations
@@ -49,8 +50,9 @@ class Route:
 
 
 class Server(ThreadingHTTPServer):
-    """Answers requests to routes, on threads of its own, until it is closed. ``port`` is the first to try; 0 takes any
-    free port. Raises PointSplatError if no port is free, or the host is not an address of this machine."""
+    """Answers requests to routes, on threads of its own, until it is closed. ``port`` is the first
+    to try; 0 takes any free port. Raises PointSplatError if no port is free, or the host is not an
+    address of this machine."""
 
     daemon_threads = True
     block_on_close = False
@@ -74,7 +76,8 @@ class Server(ThreadingHTTPServer):
                 failed = error.strerror or str(error)
         else:
             raise PointSplatError(
-                f"cannot listen on {host}, port {port} to {last - 1} ({failed}); expected another --port"
+                f"cannot listen on {host}, port {port} to {last - 1} ({failed}); expected another "
+                "--port"
             )
         name = "127.0.0.1" if host in ("", "0.0.0.0") else host
         self.url = f"http://{f'[{name}]' if ':' in name else name}:{self.server_port}"
@@ -84,16 +87,20 @@ class Server(ThreadingHTTPServer):
     def server_bind(self) -> None:
         """Bind without a look-up of the machine's name, which may take seconds."""
         TCPServer.server_bind(self)
-        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
+        self.server_name = str(self.server_address[0])
+        self.server_port = int(self.server_address[1])
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing of a client that has gone."""
 
 
-def refusal(method: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None) -> http.HTTPStatus | None:
-    """The status of a request that is refused for its sender; None if it is served. Browsers name the origin of each
-    POST. ``hosts`` are accepted names of the server; None for any."""
-    asked, origin = headers.get("Host", ""), headers.get("Origin")
+def refusal(
+    method: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None
+) -> http.HTTPStatus | None:
+    """The status of a request that is refused for its sender; None if it is served. Browsers name
+    the origin of each POST. ``hosts`` are accepted names of the server; None for any."""
+    asked = headers.get("Host", "")
+    origin = headers.get("Origin")
     name = asked[1 : asked.find("]")] if asked.startswith("[") else asked.partition(":")[0]
     if hosts is not None and name not in hosts:  # a foreign page whose name resolves to this server
         return http.HTTPStatus.FORBIDDEN
@@ -106,7 +113,8 @@ class _Handler(BaseHTTPRequestHandler):
     """Answers one request, and closes its connection."""
 
     timeout = 30  # s without a byte from a client
-    server_version, sys_version = "pointsplat", ""
+    server_version = "pointsplat"
+    sys_version = ""
 
     def log_message(self, *_: object) -> None:
         """Requests are not logged."""
@@ -134,7 +142,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self) -> Answer:
         server = cast(Server, self.server)
-        refused = refusal(self.command, {name.title(): value for name, value in self.headers.items()}, server.hosts)
+        refused = refusal(
+            self.command,
+            {name.title(): value for name, value in self.headers.items()},
+            server.hosts,
+        )
         if refused is not None:
             return Answer(status=refused)
         try:

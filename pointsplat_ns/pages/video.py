@@ -24,8 +24,9 @@ _FRAME = re.compile(r"frame_\d{5,}\.png")
 
 
 def check_output(output: Path | str, force: bool) -> Kind:
-    """The kind of an output, checked before the long work: a video (.mp4), one picture (.png), or a folder of frames
-    (no suffix). Raises SceneError if the path has another suffix, cannot be written, or must not be overwritten."""
+    """The kind of an output, checked before the long work: a video (.mp4), one picture (.png), or a
+    folder of frames (no suffix). Raises SceneError if the path has another suffix, cannot be
+    written, or must not be overwritten."""
     path = Path(output)
     if path.is_dir() or not path.suffix:
         need_folder(path)
@@ -33,22 +34,25 @@ def check_output(output: Path | str, force: bool) -> Kind:
         if others := [name for name in found if not _FRAME.fullmatch(name)]:
             raise SceneError(f"{path}: holds {others[0]}; expected a new folder, or one of frames")
         if found and not force:
-            raise SceneError(f"{path}: holds frames already; name another folder, or overwrite them with --force")
+            raise SceneError(
+                f"{path}: holds frames already; name another folder, or overwrite them with --force"
+            )
         return "frames"
     kinds: dict[str, Kind] = {".mp4": "video", ".png": "picture"}
     kind = kinds.get(path.suffix.lower())
     if kind is None:
         raise SceneError(
-            f"{path}: cannot write a {path.suffix} file; expected a video (.mp4), a picture (.png) or a folder, whose "
-            "name has no dot"
+            f"{path}: cannot write a {path.suffix} file; expected a video (.mp4), a picture (.png) "
+            "or a folder, whose name has no dot"
         )
     need_writable(path, force)
     return kind
 
 
 def write_frames(frames: Iterable[np.ndarray], path: Path, kind: Kind, fps: float) -> int:
-    """Write all frames, (H, W, 3) uint8 each, or none, over what is there; returns their number. Those of a video have
-    one size, of even width and height; a picture is one frame. Raises SceneError if it cannot be written."""
+    """Write all frames, (H, W, 3) uint8 each, or none, over what is there; returns their number.
+    Those of a video have one size, of even width and height; a picture is one frame. Raises
+    SceneError if it cannot be written."""
     if kind == "video":
         return _write_video(frames, path, fps)
     if kind == "frames":
@@ -60,7 +64,8 @@ def write_frames(frames: Iterable[np.ndarray], path: Path, kind: Kind, fps: floa
 
 
 def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
-    """Write frames to a temporary folder beside ``folder``, whose frames they replace once all are there."""
+    """Write frames to a temporary folder beside ``folder``, whose frames they replace once all are
+    there."""
     beside = folder.absolute().parent
     try:
         beside.mkdir(parents=True, exist_ok=True)
@@ -76,7 +81,9 @@ def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
             for new in sorted(Path(part).iterdir()):
                 new.replace(folder / new.name)
     except OSError as error:
-        raise SceneError(f"{folder}: cannot be written ({error.strerror or one_line(error)})") from error
+        raise SceneError(
+            f"{folder}: cannot be written ({error.strerror or one_line(error)})"
+        ) from error
     return count
 
 
@@ -88,7 +95,9 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
     count = 0
     with replacing(path) as part:
         try:
-            with av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+            with av.open(
+                str(part), "w", format="mp4", options={"movflags": "+faststart"}
+            ) as container:
                 rate = Fraction(fps).limit_denominator(1001)
                 stream = container.add_stream(ENCODER, rate=rate, options={"crf": "18"})
                 for pixels in frames:
@@ -102,7 +111,9 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
                         context.color_range = ColorRange.MPEG
                     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
                     frame = frame.reformat(
-                        format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+                        format="yuv420p",
+                        dst_colorspace=Colorspace.ITU709,
+                        dst_color_range=ColorRange.MPEG,
                     )
                     frame.pts = count
                     container.mux(stream.encode(frame))
@@ -110,8 +121,8 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
                 container.mux(stream.encode())
         except UnknownCodecError as error:
             raise SceneError(
-                f"{path}: PyAV {av.__version__} has no {ENCODER}; expected its wheel (pip install --force-reinstall "
-                "--only-binary av av), or write frames: a name without a dot"
+                f"{path}: PyAV {av.__version__} has no {ENCODER}; expected its wheel (pip install "
+                "--force-reinstall --only-binary av av), or write frames: a name without a dot"
             ) from error
         except av.FFmpegError as error:  # such as a full disk
             raise OSError(one_line(error)) from error

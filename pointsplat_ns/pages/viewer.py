@@ -1,5 +1,5 @@
-"""The viewer: a page that draws a scene in the browser, and asks this server for it at other shares of its
-Gaussians."""
+"""The viewer: a page that draws a scene in the browser, and asks this server for it at other shares
+of its Gaussians."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ from pointsplat_ns.pages.server import Answer, Request, Route, Server
 from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.view_source import VIEW_COUNTS
 
-READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".pt")
+READABLE_NAMES = (
+    *(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")),
+    ".pt",
+)
 """Ends of the names of files that may be dropped."""
 
 LARGEST_FILE = 4_000_000_000
@@ -37,10 +40,13 @@ class _Stage:
     """The scenes that are shown, from where, and at which shares."""
 
     def __init__(self, scenes: Sequence[ViewedScene], up: Up | None, number: int, drops: bool):
-        self.scenes, self.number = scenes, number
+        self.scenes = scenes
+        self.number = number
         first = scenes[0]
         known = first.source.known(VIEW_COUNTS.opening)
-        self.frame = FlightFrame.of(first.scene, known, first.source.sampler.up if up is None and known is None else up)
+        self.frame = FlightFrame.of(
+            first.scene, known, first.source.sampler.up if up is None and known is None else up
+        )
         found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
         self.origin = found if known is None else first.source.origin
         shown = [{"name": viewed.name, "amount": ""} for viewed in scenes]
@@ -50,13 +56,19 @@ class _Stage:
         self.html = _live_page(" and ".join(viewed.name for viewed in scenes), data, drops)
 
     def state(self, index: int, percent: int, level: Level, whole: bool) -> dict[str, Any]:
-        """What a page says of a level, with the command that makes it; ``whole`` if no better one comes."""
-        viewed, command = self.scenes[index], ""
+        """What a page says of a level, with the command that makes it; ``whole`` if no better one
+        comes."""
+        viewed = self.scenes[index]
+        command = ""
         amount = f"{len(viewed.scene):,} Gaussians"
         if percent < 100:
-            amount = f"{len(level.scene):,} of {amount}, {level.how}" + ("" if whole else ", merging ...")
+            amount = f"{len(level.scene):,} of {amount}, {level.how}" + (
+                "" if whole else ", merging ..."
+            )
             if viewed.path is not None:
-                command = shlex.join(["pointsplat", "prune", str(viewed.path), "--keep", f"{percent}%"])
+                command = shlex.join(
+                    ["pointsplat", "prune", str(viewed.path), "--keep", f"{percent}%"]
+                )
         return {"amount": amount, "command": command, "how": level.how, "whole": whole}
 
     def close(self, timeout: float) -> None:
@@ -66,13 +78,13 @@ class _Stage:
 
 
 class Viewer(AbstractContextManager["Viewer"]):
-    """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the context of a
-    ``with`` block.
+    """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the
+    context of a ``with`` block.
 
-    Without scenes, a page takes a dropped file, which ``read`` reads with its name. ``port`` is the first to try; 0
-    takes any free port. By default up is that of the first scene's known views, or estimated. Raises SceneError if no
-    Gaussian of a scene can be drawn, DataError if none of the first scene is visible, and PointSplatError if no port is
-    free.
+    Without scenes, a page takes a dropped file, which ``read`` reads with its name. ``port`` is the
+    first to try; 0 takes any free port. By default up is that of the first scene's known views, or
+    estimated. Raises SceneError if no Gaussian of a scene can be drawn, DataError if none of the
+    first scene is visible, and PointSplatError if no port is free.
     """
 
     def __init__(
@@ -84,8 +96,10 @@ class Viewer(AbstractContextManager["Viewer"]):
         read: Callable[[Path, str], ViewedScene] | None = None,
     ):
         share_freed_memory()  # each request has a thread
-        self._up, self._read = up, read
-        self._working, self._dropping = threading.Lock(), threading.Lock()
+        self._up = up
+        self._read = read
+        self._working = threading.Lock()
+        self._dropping = threading.Lock()
         self._stage: _Stage | None = None
         routes = {"/": Route(self._page), "/scene": Route(self._scene, 1_024)}
         if read is not None:
@@ -115,7 +129,8 @@ class Viewer(AbstractContextManager["Viewer"]):
             return
         self._server.shutdown()
         self._server.server_close()
-        # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
+        # Threads that are in torch when the program ends abort it: they are waited for, and these
+        # locks are kept.
         for lock in (self._working, self._dropping):
             lock.acquire(timeout=5.0)  # s
         if self._stage is not None:
@@ -123,7 +138,8 @@ class Viewer(AbstractContextManager["Viewer"]):
 
     def _show(self, scenes: Sequence[ViewedScene]) -> None:
         number = 1 if self._stage is None else self._stage.number + 1
-        before, self._stage = self._stage, _Stage(scenes, self._up, number, self._read is not None)
+        before = self._stage
+        self._stage = _Stage(scenes, self._up, number, self._read is not None)
         if before is not None:
             before.close(0.0)
 
@@ -132,12 +148,15 @@ class Viewer(AbstractContextManager["Viewer"]):
         return Answer(html, "text/html; charset=utf-8")
 
     def _scene(self, request: Request) -> Answer:
-        """A scene at a share, as SPZ unless the page has it. A page that has one waits for a better one; a page of
-        other scenes than those that are shown gets an answer to load again."""
-        wanted, stage = json.loads(request.body.read(request.length)), self._stage
+        """A scene at a share, as SPZ unless the page has it. A page that has one waits for a better
+        one; a page of other scenes than those that are shown gets an answer to load again."""
+        wanted = json.loads(request.body.read(request.length))
+        stage = self._stage
         if stage is None or wanted["stage"] != stage.number:
             return Answer(status=HTTPStatus.CONFLICT)
-        index, percent, have = int(wanted["scene"]), round(wanted["percent"]), str(wanted["have"])
+        index = int(wanted["scene"])
+        percent = round(wanted["percent"])
+        have = str(wanted["have"])
         percent = min(max(percent, 1), 100)
         viewed = dict(enumerate(stage.scenes))[index]
         if not have:
@@ -153,11 +172,14 @@ class Viewer(AbstractContextManager["Viewer"]):
         return Answer(level.spz, "application/octet-stream", headers=headers)
 
     def _drop(self, request: Request) -> Answer:
-        """Take a dropped file, and show its scene. The client's name for it is shown to people. It is no path: only its
-        end is used, if it is one of :data:`READABLE_NAMES`."""
+        """Take a dropped file, and show its scene. The client's name for it is shown to people. It
+        is no path: only its end is used, if it is one of :data:`READABLE_NAMES`."""
         assert self._read is not None
         given = request.options["name"]
-        name = "".join(sign if sign.isprintable() else "?" for sign in given.replace("\\", "/").rpartition("/")[2])[:80]
+        name = "".join(
+            sign if sign.isprintable() else "?"
+            for sign in given.replace("\\", "/").rpartition("/")[2]
+        )[:80]
         suffix = next((suffix for suffix in READABLE_NAMES if given.lower().endswith(suffix)), "")
         with self._dropping, tempfile.TemporaryDirectory(prefix="pointsplat-drop-") as folder:
             path = Path(folder) / f"scene{suffix}"
@@ -174,16 +196,27 @@ class Viewer(AbstractContextManager["Viewer"]):
 
 def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
     """The page, with scenes that it asks this server for; without a flight it only takes a file."""
-    scripts = (*((*FLIGHT_SCRIPTS, "live.js", "scene.js") if flight else ()), *(("drop.js",) if drops else ()))
+    scripts = (
+        *((*FLIGHT_SCRIPTS, "live.js", "scene.js") if flight else ()),
+        *(("drop.js",) if drops else ()),
+    )
     return page(
-        "scene.html", scripts, ("worker-src blob:", "connect-src 'self'"), title=title, flight=flight, live=True,
-        drops=READABLE_NAMES if drops else (), notes=(), missing="",
-    )  # fmt: skip
+        "scene.html",
+        scripts,
+        ("worker-src blob:", "connect-src 'self'"),
+        title=title,
+        flight=flight,
+        live=True,
+        drops=READABLE_NAMES if drops else (),
+        notes=(),
+        missing="",
+    )
 
 
 def _receive(request: Request, path: Path, suffix: str) -> None:
-    """Write the body of a request to a file. Raises SceneError if no scene has such a name, the file is empty, or there
-    is no room for it, and ValueError if the client sends less than it said."""
+    """Write the body of a request to a file. Raises SceneError if no scene has such a name, the
+    file is empty, or there is no room for it, and ValueError if the client sends less than it
+    said."""
     if not suffix:
         raise SceneError(f"{path}: not a scene; expected a file of {', '.join(READABLE_NAMES)}")
     if request.length == 0:

@@ -27,9 +27,14 @@ class Example(NamedTuple):
     mask: Tensor | None = None  # [H, W, 1] bool, the pixels that count; None for all
 
     def compared(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """An image of the view and the target on its device, both black where pixels do not count."""
+        """An image of the view and the target on its device, both black where pixels do not
+        count."""
         target = self.target.to(image)
-        return (image, target) if self.mask is None else (image * self.mask.to(image), target * self.mask.to(image))
+        return (
+            (image, target)
+            if self.mask is None
+            else (image * self.mask.to(image), target * self.mask.to(image))
+        )
 
     def psnr(self, image: Tensor) -> float:
         """PSNR of an image of the view, over the pixels that count, dB; at most ``MOST_PSNR``."""
@@ -39,13 +44,16 @@ class Example(NamedTuple):
 
 
 Photos = Sequence[Example]
-"""Photos with the views that they show; read when they are asked for. Photos of uint8 count in 255ths."""
+"""Photos with the views that they show; read when they are asked for. Photos of uint8 count in
+255ths."""
 
 
 @torch.no_grad()
 def mean_psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
     """Mean PSNR in some of the photos, dB, in every k-th of their pixels."""
-    shown = (every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device) for index in indices)
+    shown = (
+        every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device) for index in indices
+    )
     return fmean(photo.psnr(render(scene, photo.view)) for photo in shown)
 
 
@@ -55,12 +63,15 @@ def render_of(scene: Gaussians, view: View) -> Example:
     return Example(view, render(scene, view))
 
 
-def every_kth_pixel(photo: Example, side: int, device: torch.device, generator: random.Random | None = None) -> Example:
+def every_kth_pixel(
+    photo: Example, side: int, device: torch.device, generator: random.Random | None = None
+) -> Example:
     """Every k-th pixel of a photo along each axis, and the view that draws exactly these pixels.
 
     Args:
         photo: the whole photo.
-        side: longer side that is wanted, pixels; k is the largest number that leaves at least as many.
+        side: longer side that is wanted, pixels; k is the largest number that leaves at least as
+            many.
         device: of the result.
         generator: draws the first column and row; by default the middle of k.
     """
@@ -74,4 +85,6 @@ def every_kth_pixel(photo: Example, side: int, device: torch.device, generator: 
     K[0, :2] /= k
     K[1, 1] /= k
     height, width = image.shape[:2]
-    return Example(replace(view, K=K, width=width, height=height, eps2d=view.eps2d / k**2), image, mask)
+    return Example(
+        replace(view, K=K, width=width, height=height, eps2d=view.eps2d / k**2), image, mask
+    )

@@ -1,10 +1,12 @@
 """The frame of a scene that no run of nerfstudio tells of: found by small renders beside photos.
 
-Files of cameras have the frame of the data. A scene may have another: nerfstudio and gsplat turn, centre and scale the
-data before they train; programs have different ideas of up, and of the axes of cameras; editors scale scenes.
+Files of cameras have the frame of the data. A scene may have another: nerfstudio and gsplat turn,
+centre and scale the data before they train; programs have different ideas of up, and of the axes of
+cameras; editors scale scenes.
 
-Thresholds are chosen on the photos of nine captures. Photos and renders correlate by 0.83 to 0.92 in the right frame,
-by at most 0.32 where the world or the cameras are turned by axes, by 0.4 to 0.8 at four fifths of the scale.
+Thresholds are chosen on the photos of nine captures. Photos and renders correlate by 0.83 to 0.92
+in the right frame, by at most 0.32 where the world or the cameras are turned by axes, by 0.4 to 0.8
+at four fifths of the scale.
 """
 
 from __future__ import annotations
@@ -37,9 +39,11 @@ Frame = tuple[str, Tensor]
 """What leads to a frame, and poses (C, 4, 4) from camera to world in it."""
 
 
-def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], model: Path) -> Views:
-    """The views of a file of cameras in the frame of a scene, and over the background of its photos, black or white. A
-    frame that is not the given one is named in one line.
+def in_frame(
+    scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], model: Path
+) -> Views:
+    """The views of a file of cameras in the frame of a scene, and over the background of its
+    photos, black or white. A frame that is not the given one is named in one line.
 
     Args:
         scene: N Gaussians.
@@ -65,42 +69,55 @@ def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], m
         search.background = 0.0
     if not _fits(found):
         raise DataError(
-            f"{model}: renders of the scene are unlike the photos in the frame of these poses and in all others that "
-            f"were tried ({given.psnr:.1f} dB PSNR in {given.count} photos, correlation {given.own:.2f}; at best "
-            f"{found.psnr:.1f} dB and {found.own:.2f}); expected the poses and photos that the scene was trained from, "
-            "in its frame: put the dataparser_transforms.json of its run beside the scene, or name other poses "
-            "(--poses)"
+            f"{model}: renders of the scene are unlike the photos in the frame of these poses and "
+            f"in all others that were tried ({given.psnr:.1f} dB PSNR in {given.count} photos, "
+            f"correlation {given.own:.2f}; at best {found.psnr:.1f} dB and {found.own:.2f}); "
+            "expected the poses and photos that the scene was trained from, in its frame: put the "
+            "dataparser_transforms.json of its run beside the scene, or name other poses (--poses)"
         )
     if words:
         logger.info(
-            "poses are moved into the frame of the scene: %s (%.1f -> %.1f dB PSNR in %d small photos)",
-            ", ".join(words), given.psnr, found.psnr, found.count,
-        )  # fmt: skip
+            "poses are moved into the frame of the scene: %s (%.1f -> %.1f dB PSNR in %d small "
+            "photos)",
+            ", ".join(words),
+            given.psnr,
+            found.psnr,
+            found.count,
+        )
     return search.views_of(poses)
 
 
 def _fits(found: Likeness) -> bool:
-    """Whether renders are like their photos, and more than like the photos of other views, which show the same object
-    or sky: by three tenths of what is possible. Right frames have eight tenths and more."""
+    """Whether renders are like their photos, and more than like the photos of other views, which
+    show the same object or sky: by three tenths of what is possible. Right frames have eight tenths
+    and more."""
     return found.own >= max(MIN_LIKENESS, found.others + 0.3 * (1 - found.others))
 
 
 class _Search:
     """Tries frames on photos over a background."""
 
-    def __init__(self, scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], model: Path):
+    def __init__(
+        self, scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], model: Path
+    ):
         self.background = 0.0
         self.poses = invert_rigid(named.views.viewmats)
-        self._views = replace(named.views, rasterize_mode="antialiased" if scene.antialiased else "classic")
-        self._offset, self._drawn = scene.offset, thinned(scene, POSE_CHECK.max_count)
-        self._photos, self._indices = photos, list(photos)
+        self._views = replace(
+            named.views, rasterize_mode="antialiased" if scene.antialiased else "classic"
+        )
+        self._offset = scene.offset
+        self._drawn = thinned(scene, POSE_CHECK.max_count)
+        self._photos = photos
+        self._indices = list(photos)
         self._few = [self._indices[place] for place in spread_indices(len(photos), 4)]
         self._known = _known_frames(named, self.poses, model)
 
     def views_of(self, poses: Tensor) -> Views:
         """Views of poses (C, 4, 4) in the scene's frame."""
         background = torch.full_like(self._views.background, self.background)
-        return replace(self._views, viewmats=invert_rigid(poses), background=background).relative_to(self._offset)
+        return replace(
+            self._views, viewmats=invert_rigid(poses), background=background
+        ).relative_to(self._offset)
 
     def fit(self, poses: Tensor, few: bool = False) -> Likeness:
         """How much renders in poses are like photos, or like a few of them."""
@@ -109,19 +126,30 @@ class _Search:
         for index in self._few if few else self._indices:
             view, image, mask = self._photos[index]
             own = views[index]
-            shown.append((replace(own, K=view.K, width=view.width, height=view.height), image, mask))
+            shown.append(
+                (replace(own, K=view.K, width=view.width, height=view.height), image, mask)
+            )
         return likeness(self._drawn, shown)
 
     def best(self, given: Likeness) -> tuple[Likeness, list[str], Tensor]:
-        """The greatest likeness, what leads to its frame, and poses in it; ``given`` is that of the given frame."""
-        found, words, poses = given, "", self.poses
+        """The greatest likeness, what leads to its frame, and poses in it; ``given`` is that of the
+        given frame."""
+        found = given
+        words = ""
+        poses = self.poses
         others = [self._known]
         if given.own < 0.75 or not _fits(given):
-            others.append([*_turned_frames([frame for frame in self._known if frame[0] in ("", _GSPLAT)])])
+            others.append(
+                [*_turned_frames([frame for frame in self._known if frame[0] in ("", _GSPLAT)])]
+            )
         for frames in others:
-            text, best = max(frames, key=lambda frame: self.fit(frame[1], few=frames is not self._known).own)
+            text, best = max(
+                frames, key=lambda frame: self.fit(frame[1], few=frames is not self._known).own
+            )
             if (other := self.fit(best)).own > found.own + 0.02:
-                found, words, poses = other, text, best
+                found = other
+                words = text
+                poses = best
         start = poses
         scale = _best_scale(lambda factor: self.fit(_scaled(start, factor)).own)
         named = [words] if words else []
@@ -136,8 +164,8 @@ def _scaled(poses: Tensor, factor: float) -> Tensor:
 
 
 def _best_scale(likeness_at: Callable[[float], float]) -> float:
-    """The scale of positions with the greatest likeness: uphill by ever smaller steps, from 1 or, where that is
-    unlike, from the best of a hundredth to a hundred."""
+    """The scale of positions with the greatest likeness: uphill by ever smaller steps, from 1 or,
+    where that is unlike, from the best of a hundredth to a hundred."""
     scale = 1.0
     if likeness_at(scale) < MIN_LIKENESS:
         scale = max((1.25**power for power in range(-20, 21)), key=likeness_at)
@@ -149,7 +177,9 @@ def _best_scale(likeness_at: Callable[[float], float]) -> float:
             if best == power:
                 break
             power = best
-        low, middle, high = at(power - 1), at(power), at(power + 1)
+        low = at(power - 1)
+        middle = at(power)
+        high = at(power + 1)
         bend = low - 2 * middle + high
         scale *= step ** (power + (0.5 * (low - high) / bend if bend < 0 else 0.0))
         if abs(scale - 1) <= SAME_SCALE:
@@ -161,7 +191,8 @@ _GSPLAT = "normalised as gsplat does"
 
 
 def _known_frames(named: NamedViews, poses: Tensor, model: Path) -> list[Frame]:
-    """Frames that files tell of, and those that nerfstudio and gsplat make of the poses; the given one first."""
+    """Frames that files tell of, and those that nerfstudio and gsplat make of the poses; the given
+    one first."""
     frames = [("", poses)]
     raw = poses
     if named.motion is not None:
@@ -171,14 +202,17 @@ def _known_frames(named: NamedViews, poses: Tensor, model: Path) -> list[Frame]:
         frames.append(("applied_transform undone", _undone(named.saved, raw)))
         upright = Motion(torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], **DOUBLES))
         for start in (raw, upright.of(raw)):
-            frames.append(("oriented, centred and scaled as nerfstudio does", _as_nerfstudio(start)))
+            frames.append(
+                ("oriented, centred and scaled as nerfstudio does", _as_nerfstudio(start))
+            )
         if (points := colmap_points(model)) is not None:
             frames.append((_GSPLAT, _as_gsplat(raw, points)))
     return frames
 
 
 def _turned_frames(frames: list[Frame]) -> Iterator[Frame]:
-    """Frames with the world turned by axes, or the camera axes of OpenGL for those of OpenCV, or both."""
+    """Frames with the world turned by axes, or the camera axes of OpenGL for those of OpenCV, or
+    both."""
     for text, poses in frames:
         for turn in _axis_turns():
             turned = _turned(poses, turn)
@@ -196,7 +230,8 @@ def _turned(poses: Tensor, turn: Tensor, move: Tensor | None = None) -> Tensor:
 
 def _undone(motion: Motion, poses: Tensor) -> Tensor:
     """Poses before a motion."""
-    turn, move = motion.transform[:, :3], motion.transform[:, 3]
+    turn = motion.transform[:, :3]
+    move = motion.transform[:, 3]
     before = poses.clone()
     before[:, :3] = turn.T @ poses[:, :3]
     before[:, :3, 3] = (poses[:, :3, 3] / motion.scale - move) @ turn
@@ -204,23 +239,25 @@ def _undone(motion: Motion, poses: Tensor) -> Tensor:
 
 
 def _as_nerfstudio(poses: Tensor) -> Tensor:
-    """Poses that nerfstudio's dataparsers make of these: the mean of up along z, the mean of positions at the origin,
-    the largest coordinate 1."""
+    """Poses that nerfstudio's dataparsers make of these: the mean of up along z, the mean of
+    positions at the origin, the largest coordinate 1."""
     turn = smallest_turn(_up(poses), torch.tensor([0.0, 0.0, 1.0], **DOUBLES))
     moved = _turned(poses, turn, -(turn @ poses[:, :3, 3].mean(0)))
     return _scaled(moved, 1 / max(float(moved[:, :3, 3].abs().max()), 1e-12))
 
 
 def _as_gsplat(poses: Tensor, points: Tensor) -> Tensor:
-    """Poses that gsplat's examples make of these and of the points (N, 3) of a COLMAP model, up to the signs of axes:
-    the median of the places where cameras look at the origin, the median distance of cameras 1, the principal axes of
-    the points.
+    """Poses that gsplat's examples make of these and of the points (N, 3) of a COLMAP model, up to
+    the signs of axes: the median of the places where cameras look at the origin, the median
+    distance of cameras 1, the principal axes of the points.
 
     Source: ``normalize`` in ``examples/datasets/normalize.py`` of gsplat.
     """
     turn = smallest_turn(_up(poses), torch.tensor([0.0, -1.0, 0.0], **DOUBLES))
-    poses, points = _turned(poses, turn), points @ turn.T
-    positions, ahead = poses[:, :3, 3], poses[:, :3, 2]
+    poses = _turned(poses, turn)
+    points = points @ turn.T
+    positions = poses[:, :3, 3]
+    ahead = poses[:, :3, 2]
     centre = (positions - (ahead * positions).sum(1, keepdim=True) * ahead).quantile(0.5, dim=0)
     scale = 1 / float((positions - centre).norm(dim=1).quantile(0.5).clamp_min(1e-12))
     middle = points.quantile(0.5, dim=0)
@@ -248,4 +285,8 @@ def _axis_turns() -> Iterator[Tensor]:
 def _turn_text(turn: Tensor) -> str:
     """The turn as the axes of the scene, in those of the poses' world; empty for none."""
     axes = [("-" if float(row.sum()) < 0 else "") + "xyz"[int(row.abs().argmax())] for row in turn]
-    return "" if axes == ["x", "y", "z"] else f"axes x, y, z of the scene are {', '.join(axes)} of the poses"
+    return (
+        ""
+        if axes == ["x", "y", "z"]
+        else f"axes x, y, z of the scene are {', '.join(axes)} of the poses"
+    )

@@ -1,13 +1,14 @@
 """Whether poses belong to a scene: small renders of a few views tell.
 
-A view that belongs to a scene shows it, and sharp: training leaves Gaussians of a few pixels where photos looked. A
-camera in a wrong frame looks past the scene, or stands in front of a few large Gaussians. Where there are photos, a
-render is more like its own photo than like the others; likeness is a correlation, so that exposure and opacity do not
-count. Wrong frames that look much like the right one (a room upside down, a smaller scale) are found by photos alone.
+A view that belongs to a scene shows it, and sharp: training leaves Gaussians of a few pixels where
+photos looked. A camera in a wrong frame looks past the scene, or stands in front of a few large
+Gaussians. Where there are photos, a render is more like its own photo than like the others;
+likeness is a correlation, so that exposure and opacity do not count. Wrong frames that look much
+like the right one (a room upside down, a smaller scale) are found by photos alone.
 
-Thresholds are chosen on four scenes of three captures in the poses of their photos, and on twelve splats in sampled
-views. All pass, the splats merged to 1 % as well. Of 13 wrong frames, renders alone tell two to eleven; photos tell all
-but one of 52.
+Thresholds are chosen on four scenes of three captures in the poses of their photos, and on twelve
+splats in sampled views. All pass, the splats merged to 1 % as well. Of 13 wrong frames, renders
+alone tell two to eleven; photos tell all but one of 52.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class PoseFaults:
 
     @property
     def text(self) -> str:
-        """What is wrong, for an error; empty if at least half of the views are right, or none was drawn."""
+        """What is wrong, for an error; empty if at least half of the views are right, or none was
+        drawn."""
         if self.checked == 0 or 2 * (self.empty + self.smeared) <= self.checked:
             return ""
         seen = f"{self.checked - self.empty} of {self.checked} cameras see anything of the scene"
@@ -69,18 +71,21 @@ class PoseFaults:
 
 @torch.no_grad()
 def pose_faults(scene: Gaussians, views: Views) -> PoseFaults:
-    """What is wrong with the views of a scene, found by small renders. A scene that shows nothing has no fault.
+    """What is wrong with the views of a scene, found by small renders. A scene that shows nothing
+    has no fault.
 
-    A view shows something if the scene covers a hundredth of its picture; objects of captures cover 5 % and more. It
-    is sharp if on a quarter of what is covered (the rest may be a sky, or out of focus) Gaussians subtend at most 0.03
-    radians, or, in scenes of few Gaussians, five times what one of the median size does at half the diagonal of the
-    content; the largest of right poses is three times.
+    A view shows something if the scene covers a hundredth of its picture; objects of captures cover
+    5 % and more. It is sharp if on a quarter of what is covered (the rest may be a sky, or out of
+    focus) Gaussians subtend at most 0.03 radians, or, in scenes of few Gaussians, five times what
+    one of the median size does at half the diagonal of the content; the largest of right poses is
+    three times.
     """
     visible = scene.usable() & (scene.alphas >= ALPHA_MIN)
     if not bool(visible.any()) or len(views) == 0:
         return PoseFaults(0, 0, 0)
     every = scene[visible]
-    drawn, step = thinned(every, POSE_CHECK.max_count), thinning(len(every), POSE_CHECK.max_count)
+    drawn = thinned(every, POSE_CHECK.max_count)
+    step = thinning(len(every), POSE_CHECK.max_count)
     stds = every[::step].stds.double().sort(dim=1).values
     widths = (stds[:, 1] * stds[:, 2]).sqrt()  # scene units
     limit = max(0.03, 5.0 * float(widths.median()) / (0.5 * content_size(drawn)[1]))
@@ -96,7 +101,8 @@ def pose_faults(scene: Gaussians, views: Views) -> PoseFaults:
 
 
 def _sharpest_angle(scene: Gaussians, widths: Tensor, pixels: Tensor, view: View) -> float:
-    """The angle, radians, that a quarter of a picture stays below: that of the width of the Gaussian on each pixel."""
+    """The angle, radians, that a quarter of a picture stays below: that of the width of the
+    Gaussian on each pixel."""
     viewmat = view.viewmat.to(widths)
     distances = (scene.means.double() @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)
     angles, order = (widths / distances.clamp_min(torch.finfo(torch.float64).tiny)).sort()
@@ -119,13 +125,14 @@ class Likeness:
 
     @property
     def text(self) -> str:
-        """What is wrong, for an error; empty if renders are like their own photos, or there is none. Right poses have
-        an advantage of 0.43 and more over the photos of other views, wrong frames up to 0.3: a kitchen at half the
-        scale."""
+        """What is wrong, for an error; empty if renders are like their own photos, or there is
+        none. Right poses have an advantage of 0.43 and more over the photos of other views, wrong
+        frames up to 0.3: a kitchen at half the scale."""
         if self.count == 0 or self.own >= MIN_LIKENESS or self.own - self.others >= 0.2:
             return ""
         return (
-            f"renders of the scene are no more like the photos of their views than like others ({self.psnr:.1f} dB "
+            "renders of the scene are no more like the photos of their views than like others "
+            f"({self.psnr:.1f} dB "
             f"PSNR in {self.count} photos, correlation {self.own:.2f} and {self.others:.2f})"
         )
 
@@ -138,18 +145,29 @@ Photo = tuple[View, Tensor, Tensor | None]
 def likeness(scene: Gaussians, photos: Sequence[Photo]) -> Likeness:
     """How much small renders of a scene are like photos. Masked pixels do not count."""
     drawn = thinned(scene, POSE_CHECK.max_count)
-    shown, taken, psnrs = [], [], []
+    shown = []
+    taken = []
+    psnrs = []
     for view, photo, mask in photos:
         k = max(1, max(view.width, view.height) // POSE_CHECK.side)
         size = max(1, view.height // k), max(1, view.width // k)
         stretch = view.K.new_tensor([[size[1] / view.width], [size[0] / view.height], [1.0]])
         small = replace(view, K=view.K * stretch, width=size[1], height=size[0])
-        counted = torch.ones(1, *photo.shape[:2], **FLOATS) if mask is None else mask.permute(2, 0, 1).cpu()
+        counted = (
+            torch.ones(1, *photo.shape[:2], **FLOATS)
+            if mask is None
+            else mask.permute(2, 0, 1).cpu()
+        )
         weight = F.adaptive_avg_pool2d(counted.double(), size).ge(0.5).double()
-        picture = F.adaptive_avg_pool2d(in_unit_range(photo).permute(2, 0, 1), size).double().cpu() * weight
+        picture = (
+            F.adaptive_avg_pool2d(in_unit_range(photo).permute(2, 0, 1), size).double().cpu()
+            * weight
+        )
         rendered = render(drawn, small).permute(2, 0, 1).double().cpu() * weight
         counted_share = max(float(weight.mean()), 1e-9)
-        psnrs.append(min(psnr_of(float((rendered - picture).square().mean()), counted_share), MOST_PSNR))
+        psnrs.append(
+            min(psnr_of(float((rendered - picture).square().mean()), counted_share), MOST_PSNR)
+        )
         shown.append(_standard(rendered))
         taken.append(_standard(picture))
     own = [float((a * b).sum()) for a, b in zip(shown, taken, strict=True)]
@@ -160,7 +178,12 @@ def likeness(scene: Gaussians, photos: Sequence[Photo]) -> Likeness:
         if index != other and a.shape == b.shape
     ]
     count = len(own)
-    return Likeness(sum(own) / max(1, count), sum(others) / max(1, len(others)), sum(psnrs) / max(1, count), count)
+    return Likeness(
+        sum(own) / max(1, count),
+        sum(others) / max(1, len(others)),
+        sum(psnrs) / max(1, count),
+        count,
+    )
 
 
 def _standard(picture: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
-"""Photos in a folder with the poses of a file of cameras, for scenes that no run of nerfstudio made.
+"""Photos in a folder with the poses of a file of cameras, for scenes that no run of nerfstudio
+made.
 
-The frame of the poses is checked by small renders of the dense scene, and mended by a similarity where one is found.
-Photos that fit worst are left out. Every eighth photo, by name, is held out of training, as INRIA's code, gsplat and
-nerfstudio do.
+The frame of the poses is checked by small renders of the dense scene, and mended by a similarity
+where one is found. Photos that fit worst are left out. Every eighth photo, by name, is held out of
+training, as INRIA's code, gsplat and nerfstudio do.
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ import torch
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.lenses import lens_of
-from pointsplat_ns.io.camera_files import NamedViews, camera_files_near, read_named_views, transforms_beside
+from pointsplat_ns.io.camera_files import (
+    NamedViews,
+    camera_files_near,
+    read_named_views,
+    transforms_beside,
+)
 from pointsplat_ns.io.camera_files.colmap import model_folder
 from pointsplat_ns.io.files import bytes_text, logger, require_memory
 from pointsplat_ns.io.photos import PhotoReader, photo_files, photos_of_cameras
@@ -61,37 +67,48 @@ def read_with_photos(
     progress: Progress = silent,
     training: bool = True,
 ) -> tuple[Gaussians, PosedPhotos]:
-    """Read a scene, and the photos in a folder, reduced to the resolution; they stay in memory, a byte a channel.
-    Photos that cannot be used are named and left out.
+    """Read a scene, and the photos in a folder, reduced to the resolution; they stay in memory, a
+    byte a channel. Photos that cannot be used are named and left out.
 
     Args:
-        scene: N Gaussians, or the path of a scene, beside which cameras and ``dataparser_transforms.json`` are looked
-            for.
+        scene: N Gaussians, or the path of a scene, beside which cameras and
+            ``dataparser_transforms.json`` are looked for.
         folder: of the photos.
-        poses: a file of cameras; by default one in the folder of the photos, above it, or beside the scene.
+        poses: a file of cameras; by default one in the folder of the photos, above it, or beside
+            the scene.
         data: of a run; expected to be None.
-        resolution: width and height, pixels; the longer side bounds that of photos. By default 1600.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        resolution: width and height, pixels; the longer side bounds that of photos. By default
+            1600.
+        progress: called with the name of the current task and the share of it that is done, in [0,
+            1].
         training: whether to read the photos that are not held out.
 
     Raises:
         SceneError: if ``poses`` is no path or None, or ``data`` is named.
-        DataError: if there are no photos or poses, too few of them belong together, or renders of the scene are not
-            like the photos in any frame that was tried; if most photos cannot be used, or they take more memory than
-            is free.
+        DataError: if there are no photos or poses, too few of them belong together, or renders of
+            the scene are not like the photos in any frame that was tried; if most photos cannot be
+            used, or they take more memory than is free.
     """
     if not (poses is None or isinstance(poses, (str, Path))) or without_poses(poses):
-        raise SceneError(f"{folder}: photos need the file with their poses; expected its path, or none to look for it")
+        raise SceneError(
+            f"{folder}: photos need the file with their poses; expected its path, or none to look "
+            "for it"
+        )
     if data is not None:
-        raise SceneError(f"{data}: the data of a run, but photos are read from {folder}; expected one of both")
-    dense, path = (scene, None) if isinstance(scene, Gaussians) else (read_scene(scene), Path(scene))
+        raise SceneError(
+            f"{data}: the data of a run, but photos are read from {folder}; expected one of both"
+        )
+    dense, path = (
+        (scene, None) if isinstance(scene, Gaussians) else (read_scene(scene), Path(scene))
+    )
     model, named, files = _posed_files(folder, poses, path)
     order = sorted(files, key=lambda index: named.names[index])
     held = order[::8]
     side = 1600 if resolution is None else max(resolution)  # as in 3DGS training
     faults: dict[int, DataError] = {}
     masks = model if model.is_dir() else model.parent
-    reader, small = PhotoReader(masks, side, folder), PhotoReader(masks, POSE_CHECK.side, folder)
+    reader = PhotoReader(masks, side, folder)
+    small = PhotoReader(masks, POSE_CHECK.side, folder)
 
     def size(index: int) -> int:
         masked = reader.mask_of(files[index], named.cameras[index]) is not None
@@ -105,12 +122,16 @@ def read_with_photos(
     progress("finding the frame of the photos", 0.0)
     every = [index for index in sorted(files) if index not in faults]
     few = [every[place] for place in spread_indices(len(every), POSE_CHECK.views)]
-    shown = _usable(lambda index: _example(small, named, named.views, index, files[index]), few, faults)
+    shown = _usable(
+        lambda index: _example(small, named, named.views, index, files[index]), few, faults
+    )
     views = in_frame(dense, named, shown, model)
     examples = _usable(
-        lambda index: _example(reader, named, views, index, files[index]), [*sizes], faults,
+        lambda index: _example(reader, named, views, index, files[index]),
+        [*sizes],
+        faults,
         lambda done: progress("reading photos", done),
-    )  # fmt: skip
+    )
     psnrs = _outliers(dense, examples, progress)
     for why, lines in (
         ("cannot be used", [str(error) for error in faults.values()]),
@@ -120,24 +141,35 @@ def read_with_photos(
             more = f" and {len(lines) - 6} more" if len(lines) > 6 else ""
             logger.info("photos that %s are left out: %s%s", why, ", ".join(lines[:6]), more)
     good = [index for index in order if index in examples and index not in psnrs]
-    bent = any(lens_of(named.cameras[index].model, named.cameras[index].distortion) for index in examples)
+    bent = any(
+        lens_of(named.cameras[index].model, named.cameras[index].distortion) for index in examples
+    )
     masked = any(reader.mask_of(files[index], named.cameras[index]) for index in examples)
     logger.info(
         "photos: %d of %s%s, poses of %s; %d are held out; %s in memory",
-        len(examples), folder, ", undistorted" * bent + ", with masks" * masked, model, len({*good} & {*held}),
+        len(examples),
+        folder,
+        ", undistorted" * bent + ", with masks" * masked,
+        model,
+        len({*good} & {*held}),
         bytes_text(sum(sizes[index] for index in examples)),
-    )  # fmt: skip
+    )
     apart = [examples[i] for i in good if i in held]
-    return dense, PosedPhotos(views.resized(side), [examples[i] for i in good if i not in held], apart, model)
+    return dense, PosedPhotos(
+        views.resized(side), [examples[i] for i in good if i not in held], apart, model
+    )
 
 
 def held_out_text(dense: Gaussians, results: Sequence[Gaussians], photos: Photos) -> str:
-    """Text on the PSNR of results in held-out photos, one after the other, and of the dense scene, which is on the
-    device that renders."""
+    """Text on the PSNR of results in held-out photos, one after the other, and of the dense scene,
+    which is on the device that renders."""
     shown = spread_indices(len(photos), VIEW_COUNTS.compared)
     *psnrs, best = (mean_psnr(scene.to(dense.device), photos, shown) for scene in (*results, dense))
     figures = " -> ".join(f"{psnr:.1f}" for psnr in psnrs)
-    return f"held-out photos: {figures} dB PSNR in {len(shown)} photos, of the dense scene {best:.1f} dB"
+    return (
+        f"held-out photos: {figures} dB PSNR in {len(shown)} photos, of the dense scene "
+        f"{best:.1f} dB"
+    )
 
 
 def _usable(
@@ -146,8 +178,8 @@ def _usable(
     faults: dict[int, DataError],
     progress: Callable[[float], None] = lambda done: None,
 ) -> dict[int, _Read]:
-    """What is read for each index, by two threads, and in ``faults`` the errors of the others. Raises the first error
-    if most have one."""
+    """What is read for each index, by two threads, and in ``faults`` the errors of the others.
+    Raises the first error if most have one."""
 
     def attempt(index: int) -> _Read | DataError:
         try:
@@ -158,7 +190,9 @@ def _usable(
     found: dict[int, _Read] = {}
     with ThreadPoolExecutor(2, thread_name_prefix="photos") as pool:
         try:
-            for done, (index, result) in enumerate(zip(indices, pool.map(attempt, indices), strict=True)):
+            for done, (index, result) in enumerate(
+                zip(indices, pool.map(attempt, indices), strict=True)
+            ):
                 if isinstance(result, DataError):
                     faults[index] = result
                 else:
@@ -180,8 +214,8 @@ def _posed_files(
     places = [Path(poses)] if poses is not None else _camera_files(folder, scene)
     if not places:
         raise DataError(
-            f"{folder}: no poses there, above it or beside the scene; name them (--poses): a COLMAP model, "
-            "transforms.json of nerfstudio, or cameras.json of 3DGS"
+            f"{folder}: no poses there, above it or beside the scene; name them (--poses): a "
+            "COLMAP model, transforms.json of nerfstudio, or cameras.json of 3DGS"
         )
     transforms = None if scene is None else transforms_beside(scene)
     why = ""
@@ -196,11 +230,17 @@ def _posed_files(
         files = photos_of_cameras(folder, names, named)
         if len(files) >= LEAST_PHOTOS:
             if len(files) < len(named.names):
-                logger.info("%s: %d of its %d cameras have no photo in %s", place, len(named.names) - len(files),
-                            len(named.names), folder)  # fmt: skip
+                logger.info(
+                    "%s: %d of its %d cameras have no photo in %s",
+                    place,
+                    len(named.names) - len(files),
+                    len(named.names),
+                    folder,
+                )
             return place, named, files
         why = why or (
-            f"{place}: {len(files)} of its {len(named.names)} cameras have a photo in {folder}; expected at least "
+            f"{place}: {len(files)} of its {len(named.names)} cameras have a photo in {folder}; "
+            "expected at least "
             f"{LEAST_PHOTOS}. Names of cameras: {_two(named.names)}; of photos: {_two(names)}"
         )
     raise DataError(why)
@@ -214,21 +254,28 @@ def _camera_files(folder: Path, scene: Path | None) -> list[Path]:
     """Files of cameras in the folder of photos, above it, or beside the scene."""
     places: list[Path] = []
     for above in (folder.absolute(), folder.absolute().parent):
-        places += [above / name for name in ("transforms.json", "cameras.json") if (above / name).is_file()]
+        places += [
+            above / name for name in ("transforms.json", "cameras.json") if (above / name).is_file()
+        ]
         places += [above] if model_folder(above) is not None else []
     return [*places, *([] if scene is None else camera_files_near(scene))]
 
 
-def _example(reader: PhotoReader, named: NamedViews, views: Views, index: int, path: Path) -> Example:
+def _example(
+    reader: PhotoReader, named: NamedViews, views: Views, index: int, path: Path
+) -> Example:
     photo = reader.read(path, named.cameras[index])
     height, width = photo.image.shape[:2]
     view = replace(views[index], K=photo.K.to(views.Ks), width=width, height=height)
     return Example(view, photo.image, photo.mask)
 
 
-def _outliers(dense: Gaussians, examples: Mapping[int, Example], progress: Progress) -> dict[int, float]:
-    """PSNR of the photos that fit much worse than the others, worst first: by 6 dB and by four standard deviations,
-    estimated from the median deviation. Of seven captures, two photos of one are among them."""
+def _outliers(
+    dense: Gaussians, examples: Mapping[int, Example], progress: Progress
+) -> dict[int, float]:
+    """PSNR of the photos that fit much worse than the others, worst first: by 6 dB and by four
+    standard deviations, estimated from the median deviation. Of seven captures, two photos of one
+    are among them."""
     drawn = thinned(dense, POSE_CHECK.max_count)
     psnrs = {}
     for done, (index, example) in enumerate(examples.items()):
@@ -238,4 +285,9 @@ def _outliers(dense: Gaussians, examples: Mapping[int, Example], progress: Progr
     middle = float(values.median())
     deviation = 1.4826 * float((values - middle).abs().median())
     bound = middle - max(6.0, 4 * deviation)
-    return dict(sorted(((index, psnr) for index, psnr in psnrs.items() if psnr < bound), key=lambda pair: pair[1]))
+    return dict(
+        sorted(
+            ((index, psnr) for index, psnr in psnrs.items() if psnr < bound),
+            key=lambda pair: pair[1],
+        )
+    )

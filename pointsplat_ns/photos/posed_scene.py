@@ -1,4 +1,5 @@
-"""Reads a scene together with views from a file of cameras, and checks that both have the same frame."""
+"""Reads a scene together with views from a file of cameras, and checks that both have the same
+frame."""
 
 from __future__ import annotations
 
@@ -8,7 +9,12 @@ from pathlib import Path
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.camera_files import NamedViews, camera_files_near, read_named_views, transforms_beside
+from pointsplat_ns.io.camera_files import (
+    NamedViews,
+    camera_files_near,
+    read_named_views,
+    transforms_beside,
+)
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.pictures import read_reduced
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run
@@ -27,10 +33,12 @@ def without_poses(poses: object) -> bool:
 
 def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
     """Views from a file of cameras that lies beside a scene's file or above it, see
-    :func:`~pointsplat_ns.io.camera_files.camera_files_near`; None if there is none that belongs to the scene.
+    :func:`~pointsplat_ns.io.camera_files.camera_files_near`; None if there is none that belongs to
+    the scene.
 
-    The file is named in one line. It counts if the views show the scene sharp, and either photos that lie there are
-    like renders, or a training wrote its poses in the scene's frame, or ``dataparser_transforms.json`` moves them.
+    The file is named in one line. It counts if the views show the scene sharp, and either photos
+    that lie there are like renders, or a training wrote its poses in the scene's frame, or
+    ``dataparser_transforms.json`` moves them.
     """
     for place in camera_files_near(path):
         try:
@@ -45,10 +53,13 @@ def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
     return None
 
 
-def read_found(scene: Gaussians | Path | str, poses: Path | str | None) -> tuple[Gaussians, Views | None, Path | None]:
-    """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of that file. A given one
-    is read before the scene; then both are checked against each other. Errors are those of :meth:`PosesFile.of`,
-    :func:`~pointsplat_ns.io.read_scene` and :meth:`PosesFile.check`."""
+def read_found(
+    scene: Gaussians | Path | str, poses: Path | str | None
+) -> tuple[Gaussians, Views | None, Path | None]:
+    """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of
+    that file. A given one is read before the scene; then both are checked against each other.
+    Errors are those of :meth:`PosesFile.of`, :func:`~pointsplat_ns.io.read_scene` and
+    :meth:`PosesFile.check`."""
     if poses is not None and not without_poses(poses):
         given = PosesFile.of(scene, poses)
         dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
@@ -70,8 +81,8 @@ class PosesFile:
 
     path: Path
     views: Views
-    """In the frame of the scene's file, or relative to its offset; of at most 1600 pixels on the longer side, as in
-    3DGS training."""
+    """In the frame of the scene's file, or relative to its offset; of at most 1600 pixels on the
+    longer side, as in 3DGS training."""
     named: NamedViews
     transforms: Path | None
     """What moved them into the frame of the scene, unless the file's frame is no dataset's."""
@@ -80,9 +91,9 @@ class PosesFile:
     def of(scene: Gaussians | Path | str, poses: Path | str) -> PosesFile:
         """Read the views of a scene from a file of cameras.
 
-        A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses moves them into the
-        scene's frame. Raises SceneError if a file is missing, or the transforms are not usable, and DataError if the
-        file has no usable cameras.
+        A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses
+        moves them into the scene's frame. Raises SceneError if a file is missing, or the transforms
+        are not usable, and DataError if the file has no usable cameras.
         """
         transforms = None if isinstance(scene, Gaussians) else _transforms_of(Path(scene))
         transforms = transforms or transforms_beside(poses)
@@ -94,51 +105,59 @@ class PosesFile:
         return replace(self, views=self.views.relative_to(offset))
 
     def check(self, scene: Gaussians) -> bool:
-        """Check by small renders, and by the photos that lie where the file says, that the views belong to a scene, to
-        whose offset they are relative.
+        """Check by small renders, and by the photos that lie where the file says, that the views
+        belong to a scene, to whose offset they are relative.
 
         Returns:
             Whether there were photos.
 
         Raises:
-            DataError: if most views show nothing of the scene, or nothing sharp, or renders are not like the photos. A
-                scene without a visible Gaussian is not refused here.
+            DataError: if most views show nothing of the scene, or nothing sharp, or renders are not
+                like the photos. A scene without a visible Gaussian is not refused here.
         """
         photos = self._photos()
         wrong = pose_faults(scene, self.views).text or likeness(scene, photos).text
         if not wrong:
             return bool(photos)
         mend = (
-            "nerfstudio moves and scales scenes, and its run says how in dataparser_transforms.json; put that file "
-            "beside the scene, or write the scene in the frame of its data (pointsplat convert RUN --original-frame)"
+            "nerfstudio moves and scales scenes, and its run says how in "
+            "dataparser_transforms.json; put that file beside the scene, or write the scene in the "
+            "frame of its data (pointsplat convert RUN --original-frame)"
         )
         if self.transforms is not None:
             mend = (
-                f"{self.transforms} is of another run, or the scene was moved since its training; write the scene "
-                "again from its run"
+                f"{self.transforms} is of another run, or the scene was moved since its training; "
+                "write the scene again from its run"
             )
-        raise DataError(f"{self.path}: {wrong}; poses and scene are probably in different frames: {mend}")
+        raise DataError(
+            f"{self.path}: {wrong}; poses and scene are probably in different frames: {mend}"
+        )
 
     def _photos(self) -> list[Photo]:
-        """Photos of some of the views, those that lie where the file says and have the shape of their picture."""
+        """Photos of some of the views, those that lie where the file says and have the shape of
+        their picture."""
         found: list[Photo] = []
         for index in spread_indices(len(self.views), POSE_CHECK.views):
-            file, view = self.named.photo(index), self.views[index]
+            file = self.named.photo(index)
+            view = self.views[index]
             photo = None if file is None else read_reduced(file, POSE_CHECK.side)
             # One of another shape is cut, or turned by EXIF.
-            if photo is not None and abs(photo.shape[1] * view.height / (photo.shape[0] * view.width) - 1) < 0.05:
+            if (
+                photo is not None
+                and abs(photo.shape[1] * view.height / (photo.shape[0] * view.width) - 1) < 0.05
+            ):
                 found.append((view, photo, None))
         return found
 
 
 def check_photos(scene: Gaussians, photos: Sequence[Photo], data: Path | str) -> None:
-    """Raise a DataError if renders of a scene are not like the photos of its training, a few of which are read;
-    ``data`` is the path of these."""
+    """Raise a DataError if renders of a scene are not like the photos of its training, a few of
+    which are read; ``data`` is the path of these."""
     some = [photos[index] for index in spread_indices(len(photos), POSE_CHECK.views)]
     if wrong := likeness(scene, some).text:
         raise DataError(
-            f"{data}: {wrong}; the photos or their poses are probably not those of the training: put back the data as "
-            "it was, or name the folder where it is now (--data DIR)"
+            f"{data}: {wrong}; the photos or their poses are probably not those of the training: "
+            "put back the data as it was, or name the folder where it is now (--data DIR)"
         )
 
 

@@ -9,7 +9,15 @@ from pointsplat_ns.pruning.budget import (
     parse_keep,
     resolve_keep,
 )
-from pointsplat_ns.pruning.methods import METHODS, Method, PruneSettings, method_named, need_usable, prune, score_of
+from pointsplat_ns.pruning.methods import (
+    METHODS,
+    Method,
+    PruneSettings,
+    method_named,
+    need_usable,
+    prune,
+    score_of,
+)
 from pointsplat_ns.pruning.paper import select
 from pointsplat_ns.pruning.sh_bands import band_energies, cut_sh, energy_lost
 

@@ -13,7 +13,12 @@ from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneE
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging import merge
-from pointsplat_ns.pruning.baselines import authors_score, coverage_score, opacity_score, random_score
+from pointsplat_ns.pruning.baselines import (
+    authors_score,
+    coverage_score,
+    opacity_score,
+    random_score,
+)
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.paper import paper_score, select
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
@@ -26,7 +31,8 @@ class Method:
 
     name: str
     score: Callable[..., Tensor] | None
-    """Function from a scene (and views, if needed) to scores (N,), of which the highest are kept; None for merging."""
+    """Function from a scene (and views, if needed) to scores (N,), of which the highest are kept;
+    None for merging."""
     needs_views: bool = False
     """Whether the score needs views."""
     weighs_opacity: bool = False
@@ -50,22 +56,24 @@ METHODS: dict[str, Method] = {
 
 
 def method_named(by: str, opacity_weight: float | None = None) -> Method:
-    """The method called ``by``. Raises PointSplatError if there is none, or it has no opacity weight but is given
-    one."""
+    """The method called ``by``. Raises PointSplatError if there is none, or it has no opacity
+    weight but is given one."""
     if by not in METHODS:
         raise PointSplatError(f"no method is called {by!r}; expected one of {', '.join(METHODS)}")
     if opacity_weight is not None and not METHODS[by].weighs_opacity:
         weighing = ", ".join(other.name for other in METHODS.values() if other.weighs_opacity)
         raise PointSplatError(
-            f"opacity weight {opacity_weight:g}: {by} does not weigh opacity; leave it out, or choose one of {weighing}"
+            f"opacity weight {opacity_weight:g}: {by} does not weigh opacity; leave it out, or "
+            f"choose one of {weighing}"
         )
     return METHODS[by]
 
 
 @dataclass(frozen=True)
 class PruneSettings:
-    """Pruning settings that apply to many scenes, as in training. Raises BudgetError if ``keep`` is neither a ratio nor
-    a count, and PointSplatError if the method needs views, or for what :func:`method_named` refuses."""
+    """Pruning settings that apply to many scenes, as in training. Raises BudgetError if ``keep`` is
+    neither a ratio nor a count, and PointSplatError if the method needs views, or for what
+    :func:`method_named` refuses."""
 
     keep: float | int
     """Ratio (float, at most 1) or count (int)."""
@@ -77,17 +85,21 @@ class PruneSettings:
         keep = self.keep
         if not 0 < keep < math.inf or (keep > 1 and keep != int(keep)):  # NaN fails too
             raise BudgetError(
-                f"keep is {keep:g}; expected a ratio above 0 and up to 1 (such as 0.3) or a whole number of Gaussians "
-                "(such as 50000)"
+                f"keep is {keep:g}; expected a ratio above 0 and up to 1 (such as 0.3) or a whole "
+                "number of Gaussians (such as 50000)"
             )
         if keep > 1:  # configuration files write counts as floats
             object.__setattr__(self, "keep", int(keep))
         if method_named(self.by, self.opacity_weight).needs_views:
-            raise PointSplatError(f"{self.by} looks at a scene from poses; expected a method that needs none")
+            raise PointSplatError(
+                f"{self.by} looks at a scene from poses; expected a method that needs none"
+            )
 
     def prune(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Gaussians:
         """Prune a scene with these settings; see :func:`prune`."""
-        return prune(scene, self.keep, self.by, opacity_weight=self.opacity_weight, progress=progress)
+        return prune(
+            scene, self.keep, self.by, opacity_weight=self.opacity_weight, progress=progress
+        )
 
 
 def prune(
@@ -103,8 +115,10 @@ def prune(
     Args:
         scene: N Gaussians.
         keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
-        by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original order.
-        views: views for methods that need them. Merging uses views or a sampler; for None it samples views of its own.
+        by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original
+            order.
+        views: views for methods that need them. Merging uses views or a sampler; for None it
+            samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
 
@@ -134,8 +148,8 @@ def score_of(
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Tensor:
-    """Scores (N,) float64 of a scene by a method that has a score; arguments as for :func:`prune`, and ``views`` may be
-    a function that returns them."""
+    """Scores (N,) float64 of a scene by a method that has a score; arguments as for :func:`prune`,
+    and ``views`` may be a function that returns them."""
     assert method.score is not None, f"{method.name} has no score"
     if method.needs_views:
         if views is None:
@@ -151,4 +165,6 @@ def need_usable(scene: Gaussians) -> None:
     if len(scene) == 0:
         raise SceneError("the scene holds no Gaussians that can be drawn")
     if not bool(scene.usable().any()):
-        raise SceneError(f"none of the {len(scene)} Gaussians can be drawn: all have NaN or infinite values")
+        raise SceneError(
+            f"none of the {len(scene)} Gaussians can be drawn: all have NaN or infinite values"
+        )

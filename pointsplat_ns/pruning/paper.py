@@ -1,8 +1,9 @@
-"""The paper's pruning ("Geometry-Driven Pruning Score", eq. 3): a score from opacity and volume, and its K highest.
+"""The paper's pruning ("Geometry-Driven Pruning Score", eq. 3): a score from opacity and volume,
+and its K highest.
 
-A score is a function of the scene and returns (N,) float64 on the scene's device: the higher, the more worth keeping.
-Gaussians that cannot be drawn score NaN and are left out of the statistics of the others. Scores are computed from
-logarithms and logits in float64, so that nothing overflows.
+A score is a function of the scene and returns (N,) float64 on the scene's device: the higher, the
+more worth keeping. Gaussians that cannot be drawn score NaN and are left out of the statistics of
+the others. Scores are computed from logarithms and logits in float64, so that nothing overflows.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ class ScoreError(PointSplatError, ValueError):
 
 
 def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT) -> Tensor:
-    """Eq. 3: ``opacity_weight * z(alpha) + (1 - opacity_weight) * z(4/3 pi sx sy sz)``, with z-scores over the scene.
+    """Eq. 3: ``opacity_weight * z(alpha) + (1 - opacity_weight) * z(4/3 pi sx sy sz)``, with
+    z-scores over the scene.
 
     Args:
         scene: N Gaussians.
@@ -37,7 +39,12 @@ def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT
     Raises:
         ScoreError: if ``opacity_weight`` is not in [0, 1].
     """
-    return weighted_score(scene, opacity_weight, lambda part: part.opacities[:, 0].double().sigmoid(), _relative_volume)
+    return weighted_score(
+        scene,
+        opacity_weight,
+        lambda part: part.opacities[:, 0].double().sigmoid(),
+        _relative_volume,
+    )
 
 
 def weighted_score(
@@ -50,7 +57,10 @@ def weighted_score(
     if not 0 <= opacity_weight <= 1:  # NaN fails too
         raise ScoreError(f"opacity_weight is {opacity_weight}; expected 0 to 1")
     return of_usable(
-        scene, lambda part: opacity_weight * zscore(opacity_of(part)) + (1 - opacity_weight) * zscore(size_of(part))
+        scene,
+        lambda part: (
+            opacity_weight * zscore(opacity_of(part)) + (1 - opacity_weight) * zscore(size_of(part))
+        ),
     )
 
 
@@ -67,13 +77,14 @@ def zscore(values: Tensor) -> Tensor:
 
 
 def log_volume(scene: Gaussians) -> Tensor:
-    """Natural logarithm of 4/3 pi sx sy sz, cubic scene units, (N,) float64; -Inf for a flat Gaussian."""
+    """Natural logarithm of 4/3 pi sx sy sz, cubic scene units, (N,) float64; -Inf for a flat
+    Gaussian."""
     return scene.scales.double().sum(dim=1) + math.log(4 / 3 * math.pi)
 
 
 def _relative_volume(scene: Gaussians) -> Tensor:
-    """Volumes relative to the largest, in [0, 1], (N,) float64. Their z-scores are those of the volumes, and nothing
-    overflows."""
+    """Volumes relative to the largest, in [0, 1], (N,) float64. Their z-scores are those of the
+    volumes, and nothing overflows."""
     logs = log_volume(scene)
     largest = logs.max() if len(scene) else -math.inf
     return torch.exp(logs - largest) if largest > -math.inf else torch.zeros_like(logs)
@@ -84,11 +95,14 @@ def of_usable(scene: Gaussians, score: Callable[[Gaussians], Tensor]) -> Tensor:
     usable = scene.usable()
     if bool(usable.all()):
         return score(scene)
-    return torch.full_like(usable, math.nan, dtype=torch.float64).masked_scatter_(usable, score(scene[usable]))
+    return torch.full_like(usable, math.nan, dtype=torch.float64).masked_scatter_(
+        usable, score(scene[usable])
+    )
 
 
 def select(scores: Tensor, k: int) -> Tensor:
-    """Indices (k,) int64, ascending, of the ``k`` highest scores (N,), of any floating type, +-Inf allowed.
+    """Indices (k,) int64, ascending, of the ``k`` highest scores (N,), of any floating type, +-Inf
+    allowed.
 
     Of equal scores, the lower index is taken first; NaN ranks below every number.
 

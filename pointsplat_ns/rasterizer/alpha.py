@@ -1,11 +1,13 @@
 """The rule of alpha and transmittance: which Gaussian is drawn on which pixel, and how strongly.
 
-Alpha is ``min(ALPHA_MAX, opacity * exp(-sigma))``, where sigma is half the squared Mahalanobis distance of the pixel.
-A Gaussian is not drawn on a pixel where its alpha is lower than a threshold. From front to back, each Gaussian drawn
-multiplies the transmittance by ``1 - alpha``; a pixel is finished before the Gaussian that would bring it to a second
-threshold or less. (3DGS, section 6; the thresholds stand in :mod:`~pointsplat_ns.rasterizer.constants`.)
+Alpha is ``min(ALPHA_MAX, opacity * exp(-sigma))``, where sigma is half the squared Mahalanobis
+distance of the pixel. A Gaussian is not drawn on a pixel where its alpha is lower than a threshold.
+From front to back, each Gaussian drawn multiplies the transmittance by ``1 - alpha``; a pixel is
+finished before the Gaussian that would bring it to a second threshold or less. (3DGS, section 6;
+the thresholds stand in :mod:`~pointsplat_ns.rasterizer.constants`.)
 
-The compiled kernels (``blending.cpp``) and ``lab/numerics/reference.py``, which checks both, write it out once more.
+The compiled kernels (``blending.cpp``) and ``lab/numerics/reference.py``, which checks both, write
+it out once more.
 
 Shapes: B tiles, S Gaussians of a chunk from front to back, 64 pixels of a tile.
 """
@@ -19,10 +21,12 @@ from torch import Tensor
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 
 CLAMPED = ALPHA_MAX * (1 - 1e-6)
-"""Alphas of at least this count as clamped; the margin covers the rounding of ALPHA_MAX to float32."""
+"""Alphas of at least this count as clamped; the margin covers the rounding of ALPHA_MAX to
+float32."""
 
 STEP_BY_STEP = 64
-"""Largest chunk that is scanned one Gaussian at a time; longer chunks take fewer, larger operations."""
+"""Largest chunk that is scanned one Gaussian at a time; longer chunks take fewer, larger
+operations."""
 
 
 def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Tensor:
@@ -45,13 +49,14 @@ def is_clamped(alpha: Tensor) -> Tensor:
 
 
 def is_drawn(after: Tensor, out: Tensor | None = None) -> Tensor:
-    """Mask of the pixels that a Gaussian does not finish, from the transmittance behind it; as 0 and 1 in ``out`` if
-    that is given."""
+    """Mask of the pixels that a Gaussian does not finish, from the transmittance behind it; as 0
+    and 1 in ``out`` if that is given."""
     return torch.gt(after, TRANSMITTANCE_MIN, out=out)
 
 
 def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
-    """Transmittance in front of each Gaussian of a chunk and behind the last, as if no pixel were ever finished.
+    """Transmittance in front of each Gaussian of a chunk and behind the last, as if no pixel were
+    ever finished.
 
     Args:
         passing: (B, S, 64), 1 - alpha.
@@ -65,8 +70,11 @@ def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
         for k, factor in enumerate(passing.unbind(1)):
             torch.mul(steps[k], factor, out=steps[k + 1])
         return out
-    groups = out[:, 1:].unflatten(1, (-1, size))  # products of each group at once, then group by group
-    steps, factors = groups.unbind(2), passing.unflatten(1, (-1, size)).unbind(2)
+    groups = out[:, 1:].unflatten(
+        1, (-1, size)
+    )  # products of each group at once, then group by group
+    steps = groups.unbind(2)
+    factors = passing.unflatten(1, (-1, size)).unbind(2)
     steps[0].copy_(factors[0])
     for k in range(1, size):
         torch.mul(steps[k - 1], factors[k], out=steps[k])

@@ -1,8 +1,8 @@
 """Front-to-back alpha blending over tiles, with its own backward pass.
 
-Done in torch (:mod:`~pointsplat_ns.rasterizer.blocks`), or by compiled kernels where they were built
-(:mod:`~pointsplat_ns.rasterizer.compiled.blending`), by the algebra of :mod:`~pointsplat_ns.rasterizer.quadratics` and
-the rule of :mod:`~pointsplat_ns.rasterizer.alpha`.
+Done in torch (:mod:`~pointsplat_ns.rasterizer.blocks`), or by compiled kernels where they were
+built (:mod:`~pointsplat_ns.rasterizer.compiled.blending`), by the algebra of
+:mod:`~pointsplat_ns.rasterizer.quadratics` and the rule of :mod:`~pointsplat_ns.rasterizer.alpha`.
 
 Shapes: M Gaussians, 64 = TILE * TILE pixels, D channels.
 """
@@ -25,7 +25,11 @@ from pointsplat_ns.system.tensors import full_precision
 def untiled(values: Tensor, columns: int) -> Tensor:
     """Pixels (H, W, D) of tiles (rows * columns, [D,] 64)."""
     rows = len(values) // columns
-    return values.view(rows, columns, -1, TILE, TILE).permute(0, 3, 1, 4, 2).reshape(rows * TILE, columns * TILE, -1)
+    return (
+        values.view(rows, columns, -1, TILE, TILE)
+        .permute(0, 3, 1, 4, 2)
+        .reshape(rows * TILE, columns * TILE, -1)
+    )
 
 
 def tiled(values: Tensor, rows: int, columns: int) -> Tensor:
@@ -33,7 +37,11 @@ def tiled(values: Tensor, rows: int, columns: int) -> Tensor:
     height, width, channels = values.shape
     whole = values.new_zeros(rows * TILE, columns * TILE, channels)
     whole[:height, :width] = values
-    return whole.view(rows, TILE, columns, TILE, channels).permute(0, 2, 4, 1, 3).reshape(-1, channels, PIXELS)
+    return (
+        whole.view(rows, TILE, columns, TILE, channels)
+        .permute(0, 2, 4, 1, 3)
+        .reshape(-1, channels, PIXELS)
+    )
 
 
 class Blend(torch.autograd.Function):
@@ -43,7 +51,8 @@ class Blend(torch.autograd.Function):
     def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, rows, keep_lists, absgrad):
         """The lists are kept for the backward pass only if ``keep_lists``."""
         engine = compiled_blending if footprints.compiled else blocks
-        grid, tiles = footprints.grid, footprints.tiles(*rows)
+        grid = footprints.grid
+        tiles = footprints.tiles(*rows)
         image = colors.new_empty(tiles.offsets.numel() - 1, colors.shape[1], PIXELS)
         final = colors.new_empty(tiles.offsets.numel() - 1, PIXELS)
         inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, grid.alpha_min)
@@ -72,7 +81,8 @@ class Blend(torch.autograd.Function):
         summed = engine.differentiate_region(
             grid, tiles, inputs, tape, final, grad_image, grad_final, absgrad is not None
         )
-        first, last = MOMENTS, MOMENTS + colors.shape[1]
+        first = MOMENTS
+        last = MOMENTS + colors.shape[1]
         if absgrad is not None:
             absgrad[0].index_add_(0, absgrad[1], summed[:, last:])
         grads = engine.chain(summed[:, :first], cov2d, det, opacities)
@@ -92,10 +102,10 @@ def blend(
         seen: M projected Gaussians.
         colors: (M, D), D at most 4 for kernels.
         footprints: of the same Gaussians, by kernels if these are to blend.
-        memory_budget: an image whose lists of pairs would take more bytes is drawn in several bands, one after the
-            other, and their lists are computed again for the backward pass.
-        absgrad: (K, 2), to which the backward pass adds the sums over pixels of the absolute gradients of means2d, and
-            their rows in it, (M,) int64.
+        memory_budget: an image whose lists of pairs would take more bytes is drawn in several
+            bands, one after the other, and their lists are computed again for the backward pass.
+        absgrad: (K, 2), to which the backward pass adds the sums over pixels of the absolute
+            gradients of means2d, and their rows in it, (M,) int64.
 
     Returns:
         Colours (H, W, D) over black, and the remaining transmittance (H, W, 1).
@@ -104,10 +114,14 @@ def blend(
     # 192 bytes a pair of RGB in float32: lists, tape, gradient sums, of which each channel has one
     bands = footprints.regions(max(1, memory_budget // (48 * size + (colors.shape[1] - 3) * size)))
     shapes = seen.means2d, seen.cov2d, seen.det, seen.opacities
-    drawn = [Blend.apply(*shapes, colors, footprints, rows, len(bands) == 1, absgrad) for rows in bands]
+    drawn = [
+        Blend.apply(*shapes, colors, footprints, rows, len(bands) == 1, absgrad) for rows in bands
+    ]
     grid = footprints.grid
     image, through = (
-        untiled(parts[0] if len(parts) == 1 else torch.cat(parts), grid.columns)[: grid.height, : grid.width]
+        untiled(parts[0] if len(parts) == 1 else torch.cat(parts), grid.columns)[
+            : grid.height, : grid.width
+        ]
         for parts in zip(*drawn, strict=True)
     )
     return image, through

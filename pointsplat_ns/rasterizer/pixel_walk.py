@@ -1,9 +1,11 @@
 """Sums over the pixels of a view, for each Gaussian, that no gradient of the picture gives.
 
-Such as how many pixels a Gaussian is drawn on, or the sum of squares of the gradients of each pixel. The projected
-Gaussians of a view are walked front to back, tile by tile, by the rasterizer's rules.
+Such as how many pixels a Gaussian is drawn on, or the sum of squares of the gradients of each
+pixel. The projected Gaussians of a view are walked front to back, tile by tile, by the rasterizer's
+rules.
 
-Shapes: M Gaussians seen, B tiles of a block, L Gaussians in the longest list of the block, 64 pixels a tile.
+Shapes: M Gaussians seen, B tiles of a block, L Gaussians in the longest list of the block, 64
+pixels a tile.
 """
 
 from __future__ import annotations
@@ -14,7 +16,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.alpha import alphas_, is_clamped, is_drawn, last_transmittance, transmittances
+from pointsplat_ns.rasterizer.alpha import (
+    alphas_,
+    is_clamped,
+    is_drawn,
+    last_transmittance,
+    transmittances,
+)
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
 from pointsplat_ns.rasterizer.projection import Projected
 from pointsplat_ns.rasterizer.quadratics import LOG2E, PIXELS
@@ -22,8 +30,8 @@ from pointsplat_ns.rasterizer.tiles import Footprints
 
 
 class PixelBlock(NamedTuple):
-    """Every Gaussian of a block of tiles on every pixel, front to back along L. Where ``alpha`` is zero the Gaussian is
-    not drawn, and ``before`` is undefined."""
+    """Every Gaussian of a block of tiles on every pixel, front to back along L. Where ``alpha`` is
+    zero the Gaussian is not drawn, and ``before`` is undefined."""
 
     ids: Tensor  # [B, L] rows of the projected Gaussians
     alpha: Tensor  # [B, L, 64]
@@ -48,11 +56,15 @@ def sum_over_pixels(
     Returns:
         (M, F), in the dtype of ``seen``.
     """
-    means2d, cov2d, det = seen.means2d.detach(), seen.cov2d.detach(), seen.det.detach()
+    means2d = seen.means2d.detach()
+    cov2d = seen.cov2d.detach()
+    det = seen.det.detach()
     total = means2d.new_zeros(len(seen.ids), columns)
     footprints = Footprints(seen, width, height, compiled=False)
     lists = footprints.tiles()
-    gaussians, starts, across = lists.gaussians, lists.offsets, footprints.grid.columns
+    gaussians = lists.gaussians
+    starts = lists.offsets
+    across = footprints.grid.columns
     xx, xy, yy = cov2d.unbind(-1)
     # As the rasterizer keeps it: extent in x given y, and extent in y; both terms are positive.
     shapes = [*means2d.unbind(-1), yy / det, xy / yy, 1.0 / yy, seen.opacities.detach().log2()]
@@ -79,14 +91,21 @@ def sum_over_pixels(
     return total
 
 
-def _walk(shape: Tensor, ids: Tensor, pixel_x: Tensor, pixel_y: Tensor, listed: Tensor, inside: Tensor) -> PixelBlock:
-    """Alphas and transmittances of a block; ``shape`` is (B, L, 6), pixels are (B, 64), ``listed`` is (B, L)."""
+def _walk(
+    shape: Tensor, ids: Tensor, pixel_x: Tensor, pixel_y: Tensor, listed: Tensor, inside: Tensor
+) -> PixelBlock:
+    """Alphas and transmittances of a block; ``shape`` is (B, L, 6), pixels are (B, 64), ``listed``
+    is (B, L)."""
     mx, my, a, r, d, log2_opacity = (value[..., None] for value in shape.unbind(-1))
-    x, y = (pixel[:, None].to(mx.dtype) + 0.5 - mean for pixel, mean in ((pixel_x, mx), (pixel_y, my)))
+    x, y = (
+        pixel[:, None].to(mx.dtype) + 0.5 - mean for pixel, mean in ((pixel_x, mx), (pixel_y, my))
+    )
     across = x - r * y
     gx = a * across
     log2_alpha = log2_opacity - 0.5 * LOG2E * (gx * across + d * y * y)
-    alpha = alphas_(torch.where(listed[..., None] & inside[:, None], log2_alpha, -torch.inf), ALPHA_MIN)
+    alpha = alphas_(
+        torch.where(listed[..., None] & inside[:, None], log2_alpha, -torch.inf), ALPHA_MIN
+    )
     clamped = is_clamped(alpha)
     through = alpha.new_empty(alpha.shape[0], alpha.shape[1] + 1, PIXELS)
     transmittances(1.0 - alpha, torch.ones_like(alpha[:, 0]), out=through)

@@ -1,12 +1,14 @@
-"""The algebra of one Gaussian on one tile: log alpha as a quadratic, and the gradient sums that belong to it.
+"""The algebra of one Gaussian on one tile: log alpha as a quadratic, and the gradient sums that
+belong to it.
 
-For one tile and one Gaussian the logarithm of alpha is a quadratic in the pixel's offset (u, v) from the tile's centre.
-All evaluations, and all sums of gradients over pixels, are therefore products with one 6 x 64 matrix of monomials.
+For one tile and one Gaussian the logarithm of alpha is a quadratic in the pixel's offset (u, v)
+from the tile's centre. All evaluations, and all sums of gradients over pixels, are therefore
+products with one 6 x 64 matrix of monomials.
 
-The quadratic form is kept as ``a w^2 + d dv^2`` with ``w = du - r dv``, ``r = xy / yy``, ``a = yy / det``,
-``d = 1 / yy``: the extent in x given y, and the extent in y. Both terms are positive, so a long needle far from its
-centre does not lose its alpha to the cancellation of huge terms. Logarithms are to base 2, as torch's ``exp2`` is four
-times as fast as its ``exp``.
+The quadratic form is kept as ``a w^2 + d dv^2`` with ``w = du - r dv``, ``r = xy / yy``, ``a = yy /
+det``, ``d = 1 / yy``: the extent in x given y, and the extent in y. Both terms are positive, so a
+long needle far from its centre does not lose its alpha to the cancellation of huge terms.
+Logarithms are to base 2, as torch's ``exp2`` is four times as fast as its ``exp``.
 
 Shapes: B tiles, S pairs of each, 64 = TILE * TILE pixels, D channels.
 """
@@ -36,24 +38,41 @@ def basis_of(like: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])
 
 
-def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-    """Rows that pairs gather, one for each Gaussian, (M + 1, 11 + D); the last row is padding, which is never drawn.
+def table_of(
+    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor
+) -> Tensor:
+    """Rows that pairs gather, one for each Gaussian, (M + 1, 11 + D); the last row is padding,
+    which is never drawn.
 
-    x, y (pixels), r, a, d (log2 per pixels^2), then the coefficients of log2 alpha on the basis as far as
-    they do not depend on the tile, then the colour.
+    x, y (pixels), r, a, d (log2 per pixels^2), then the coefficients of log2 alpha on the basis as
+    far as they do not depend on the tile, then the colour.
     """
     xx, xy, yy = cov2d.unbind(-1)
-    a, r, d = LOG2E * yy / det, xy / yy, LOG2E / yy
+    a = LOG2E * yy / det
+    r = xy / yy
+    d = LOG2E / yy
     ar = a * r
     zero = torch.zeros_like(a)
-    columns = [*means2d.unbind(-1), r, a, d, opacities.log2(), zero, zero, -0.5 * a, ar, -0.5 * (ar * r + d)]
+    columns = [
+        *means2d.unbind(-1),
+        r,
+        a,
+        d,
+        opacities.log2(),
+        zero,
+        zero,
+        -0.5 * a,
+        ar,
+        -0.5 * (ar * r + d),
+    ]
     table = F.pad(torch.cat([torch.stack(columns, dim=-1), colors], dim=-1), (0, 0, 0, 1))
     table[-1, 5] = -1e4  # log2 alpha of the padding
     return table
 
 
 class Quadratics(NamedTuple):
-    """Quadratics of a chunk of Gaussians in each tile of a block, and the colours of these Gaussians."""
+    """Quadratics of a chunk of Gaussians in each tile of a block, and the colours of these
+    Gaussians."""
 
     s: Tensor  # [B * S] w at the tile's centre, pixels
     ey: Tensor  # [B * S] dv at the tile's centre, pixels
@@ -70,7 +89,8 @@ def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Quadratics:
     mx, my, r, a, d = rows[:, :5].unbind(1)
     ey = (y[:, None] - my.view(-1, size)).view(-1)
     s = (x[:, None] - mx.view(-1, size)).view(-1).addcmul_(r, ey, value=-1.0)
-    a_s, d_ey = a * s, d * ey
+    a_s = a * s
+    d_ey = d * ey
     quadratic = rows[:, 5:11]
     quadratic[:, 0].addcmul_(a_s, s, value=-0.5).addcmul_(d_ey, ey, value=-0.5)
     torch.neg(a_s, out=quadratic[:, 1])
@@ -99,7 +119,8 @@ def moments(pairs: Quadratics, sums: Tensor, out: Tensor) -> None:
 
 
 def mean_slopes(coefficients: Tensor) -> tuple[Tensor, Tensor]:
-    """d log alpha / d mean x and y as linear functions of (1, u, v), (B * S, 3) each, from those of log2 alpha.
+    """d log alpha / d mean x and y as linear functions of (1, u, v), (B * S, 3) each, from those of
+    log2 alpha.
 
     The gradient of log alpha by the mean is minus its gradient by the pixel.
     """
@@ -107,14 +128,21 @@ def mean_slopes(coefficients: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([cu, 2 * cuu, cuv], dim=-1), torch.stack([cv, cuv, 2 * cvv], dim=-1)
 
 
-def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of means2d, cov2d, det and opacities from the moments of each Gaussian, (M, MOMENTS)."""
+def chain(
+    summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of means2d, cov2d, det and opacities from the moments of each Gaussian, (M,
+    MOMENTS)."""
     w, ww, v, vv, wv, one = summed.unbind(-1)
     xx, xy, yy = cov2d.unbind(-1)
-    a, r, d = yy / det, xy / yy, 1.0 / yy
+    a = yy / det
+    r = xy / yy
+    d = 1.0 / yy
     grad_x = a * w
     grad_means2d = torch.stack([grad_x, d * v - r * grad_x], dim=-1)
-    grad_a, grad_r, grad_d = -0.5 * ww, a * wv, -0.5 * vv
+    grad_a = -0.5 * ww
+    grad_r = a * wv
+    grad_d = -0.5 * vv
     grad_yy = grad_a / det - (grad_r * r + grad_d * d) * d
     grad_cov2d = torch.stack([torch.zeros_like(xx), grad_r * d, grad_yy], dim=-1)
     grad_det = -grad_a * a / det

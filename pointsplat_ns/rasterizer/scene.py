@@ -24,16 +24,17 @@ def render(
     quality: QualityName = "exact",
     backend: Literal["torch", "gsplat", "auto"] = "torch",
 ) -> Tensor:
-    """Render a scene from one view or several, over the views' background. Differentiable in the scene. The picture is
-    antialiased if the scene or the view is.
+    """Render a scene from one view or several, over the views' background. Differentiable in the
+    scene. The picture is antialiased if the scene or the view is.
 
     Args:
         scene: N Gaussians, on any device; the picture is rendered there.
-        views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are then drawn one after
-            the other.
-        quality: "exact", or faster and less accurate, "balanced" or "fast", as for :func:`pointsplat_ns.rasterization`.
-        backend: "torch", or gsplat where it can be used ("auto"), as for :func:`pointsplat_ns.rasterization`. gsplat
-            leaves out tests of what it is given.
+        views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are
+            then drawn one after the other.
+        quality: "exact", or faster and less accurate, "balanced" or "fast", as for
+            :func:`pointsplat_ns.rasterization`.
+        backend: "torch", or gsplat where it can be used ("auto"), as for
+            :func:`pointsplat_ns.rasterization`. gsplat leaves out tests of what it is given.
 
     Returns:
         Colours in [0, 1]: (H, W, 3) for a view, (C, H, W, 3) for C views.
@@ -43,7 +44,8 @@ def render(
         ValueError: if a camera is not finite or has no focal length, or there is no such quality.
 
     Warns:
-        UserWarning: if some Gaussians are not :meth:`~pointsplat_ns.Gaussians.usable`; their gradients are 0.
+        UserWarning: if some Gaussians are not :meth:`~pointsplat_ns.Gaussians.usable`; their
+        gradients are 0.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -57,7 +59,9 @@ def render(
             return scene.means.new_zeros(0, views.height, views.width, 3)
         return torch.stack([render(scene, view, quality, backend) for view in views])
     if not isinstance(views, View):
-        raise TypeError(f"views is {views!r}; expected a View or Views, such as sample_views(scene, 3)")
+        raise TypeError(
+            f"views is {views!r}; expected a View or Views, such as sample_views(scene, 3)"
+        )
     return render_with_alpha(scene, views, quality, backend)[0]
 
 
@@ -67,12 +71,17 @@ def render_with_alpha(
     quality: QualityName = "exact",
     backend: Literal["torch", "gsplat", "auto"] = "torch",
 ) -> tuple[Tensor, Tensor]:
-    """Picture (H, W, 3) of one view and its alpha (H, W, 1), both in [0, 1]. Arguments and errors are those of
-    :func:`render`."""
+    """Picture (H, W, 3) of one view and its alpha (H, W, 1), both in [0, 1]. Arguments and errors
+    are those of :func:`render`."""
     with one_thread_each():
-        fixed = not (torch.is_grad_enabled() and (view.viewmat.requires_grad or view.background.requires_grad))
+        fixed = not (
+            torch.is_grad_enabled()
+            and (view.viewmat.requires_grad or view.background.requires_grad)
+        )
         if fixed and backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
-            drawn = pictures.picture(scene, camera_to(scene, view), view.background, QUALITIES[quality])
+            drawn = pictures.picture(
+                scene, camera_to(scene, view), view.background, QUALITIES[quality]
+            )
             if drawn is not None:
                 image, alpha, skipped = drawn
                 _warn_of(skipped, scene)
@@ -107,15 +116,16 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
 
 
 def _warn_of(skipped: int, scene: Gaussians) -> None:
-    """Warn of Gaussians that are not drawn because of their values, once for each number of them."""
+    """Warn of Gaussians that are not drawn because of their values, once for each number of
+    them."""
     if skipped:
         text = f"{skipped} of {len(scene)} Gaussians have NaN or infinite values and are not drawn"
         warnings.warn(text, stacklevel=1)  # of one line, so that one text is shown once
 
 
 def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
-    """Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1], of each pixel of a
-    view. The images are rendered on the scene's device."""
+    """Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1], of
+    each pixel of a view. The images are rendered on the scene's device."""
     with one_thread_each():
         colors = scene.means  # any: only depths are rendered
         depth, alpha = _rasterized(scene, view, colors, render_mode="ED")
@@ -123,24 +133,28 @@ def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
 
 
 def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Tensor:
-    """Visible pixels of each Gaussian, (N,), at least float32: the sum over the pixels of a picture of its blending
-    weight, which is its alpha times the transmittance in front of it. It is the gradient of the sum of the picture by
-    the colour, and 0 where the view does not show the Gaussian. ``compiled`` is that of
-    :func:`pointsplat_ns.rasterization`."""
+    """Visible pixels of each Gaussian, (N,), at least float32: the sum over the pixels of a picture
+    of its blending weight, which is its alpha times the transmittance in front of it. It is the
+    gradient of the sum of the picture by the colour, and 0 where the view does not show the
+    Gaussian. ``compiled`` is that of :func:`pointsplat_ns.rasterization`."""
     with one_thread_each():
         if pictures.can_draw(single := _at_least_single(scene), compiled):
             weights = pictures.weights(single, camera_to(scene, view), ALPHA_MIN)
             if weights is not None:
                 return weights
-    return pixel_sums(scene, view, single.means.new_ones(view.height, view.width, 1), compiled)[:, 0]
+    return pixel_sums(scene, view, single.means.new_ones(view.height, view.width, 1), compiled)[
+        :, 0
+    ]
 
 
 def pixel_sums(scene: Gaussians, view: View, maps: Tensor, compiled: bool | None = None) -> Tensor:
-    """Sums (N, D) over the pixels of a view of the blending weight of each Gaussian times the values of D maps,
-    (H, W, D): :func:`pixels_of` for a map of ones."""
+    """Sums (N, D) over the pixels of a view of the blending weight of each Gaussian times the
+    values of D maps, (H, W, D): :func:`pixels_of` for a map of ones."""
     scene = _at_least_single(scene)
     with one_thread_each(), torch.enable_grad():
-        colors = torch.zeros(len(scene), maps.shape[-1], dtype=scene.dtype, device=scene.device).requires_grad_()
+        colors = torch.zeros(
+            len(scene), maps.shape[-1], dtype=scene.dtype, device=scene.device
+        ).requires_grad_()
         image, _ = _rasterized(scene, view, colors, compiled=compiled)
         (sums,) = torch.autograd.grad(image, colors, maps.to(image))
     return sums

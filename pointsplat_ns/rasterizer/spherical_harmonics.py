@@ -1,4 +1,5 @@
-"""Colours of Gaussians from real spherical harmonics up to degree 3: in torch, or by compiled kernels."""
+"""Colours of Gaussians from real spherical harmonics up to degree 3: in torch, or by compiled
+kernels."""
 
 from __future__ import annotations
 
@@ -14,35 +15,76 @@ from pointsplat_ns.system.tensors import full_precision
 
 
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
-    """Gradient (3, M) by the unit direction, from the gradients ((degree + 1)^2, M) of the basis."""
+    """Gradient (3, M) by the unit direction, from the gradients ((degree + 1)^2, M) of the
+    basis."""
     x, y, z = unit
-    gx, gy, gz = -C1 * grad[3], -C1 * grad[1], C1 * grad[2]
+    gx = -C1 * grad[3]
+    gy = -C1 * grad[1]
+    gz = C1 * grad[2]
     if degree >= 2:
-        a, b, c, d, e = C2[0] * grad[4], C2[0] * grad[5], 2 * C2[1] * grad[6], C2[0] * grad[7], 2 * C2[2] * grad[8]
+        a = C2[0] * grad[4]
+        b = C2[0] * grad[5]
+        c = 2 * C2[1] * grad[6]
+        d = C2[0] * grad[7]
+        e = 2 * C2[2] * grad[8]
         gx += a * y - c * x - d * z + e * x
         gy += a * x - b * z - c * y - e * y
         gz += 2 * c * z - b * y - d * x
     if degree >= 3:
-        xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
-        h0, h6 = C3[0] * grad[9], C3[0] * grad[15]
-        h1, h3, h5 = C3[1] * grad[10], C3[3] * grad[12], C3[4] * grad[14]
-        h2, h4 = C3[2] * grad[11], C3[2] * grad[13]
-        around, across = 4.0 * zz - xx - yy, 3.0 * (xx - yy)
-        gx += h1 * yz - 6 * h0 * xy + 2 * h2 * xy - 6 * h3 * xz - h4 * (around - 2 * xx) + 2 * h5 * xz - h6 * across
-        gy += h1 * xz - h0 * across - h2 * (around - 2 * yy) - 6 * h3 * yz + 2 * h4 * xy - 2 * h5 * yz + 6 * h6 * xy
-        gz += h1 * xy - 8 * h2 * yz + h3 * (6.0 * zz - 3.0 * xx - 3.0 * yy) - 8 * h4 * xz + h5 * (xx - yy)
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        xy = x * y
+        xz = x * z
+        yz = y * z
+        h0 = C3[0] * grad[9]
+        h6 = C3[0] * grad[15]
+        h1 = C3[1] * grad[10]
+        h3 = C3[3] * grad[12]
+        h5 = C3[4] * grad[14]
+        h2 = C3[2] * grad[11]
+        h4 = C3[2] * grad[13]
+        around = 4.0 * zz - xx - yy
+        across = 3.0 * (xx - yy)
+        gx += (
+            h1 * yz
+            - 6 * h0 * xy
+            + 2 * h2 * xy
+            - 6 * h3 * xz
+            - h4 * (around - 2 * xx)
+            + 2 * h5 * xz
+            - h6 * across
+        )
+        gy += (
+            h1 * xz
+            - h0 * across
+            - h2 * (around - 2 * yy)
+            - 6 * h3 * yz
+            + 2 * h4 * xy
+            - 2 * h5 * yz
+            + 6 * h6 * xy
+        )
+        gz += (
+            h1 * xy
+            - 8 * h2 * yz
+            + h3 * (6.0 * zz - 3.0 * xx - 3.0 * yy)
+            - 8 * h4 * xz
+            + h5 * (xx - yy)
+        )
     return torch.stack([gx, gy, gz])
 
 
 def _blocks(count: int, on_cpu: bool) -> list[slice]:
-    """Pieces of the work: on a CPU the coefficients of one piece stay in the cache, and no copy of all is made."""
+    """Pieces of the work: on a CPU the coefficients of one piece stay in the cache, and no copy of
+    all is made."""
     # On a CPU 0.8 MB of coefficients at degree 3 at once.
     step = 4096 if on_cpu else max(count, 1)
     return [slice(start, min(start + step, count)) for start in range(0, count, step)]
 
 
 def offset(color: Tensor) -> Tensor:
-    """Add the 1/2 of 3DGS, and turn infinities to NaN: a lower bound of 0 would hide that one has no meaning."""
+    """Add the 1/2 of 3DGS, and turn infinities to NaN: a lower bound of 0 would hide that one has
+    no meaning."""
     return (color - color) + (color + 0.5)
 
 
@@ -55,7 +97,11 @@ class Color(torch.autograd.Function):
         basis = torch.stack(basis_rows(unit, degree)).T.contiguous()
         color = directions.new_empty(directions.shape[0], 3)
         for part in _blocks(color.shape[0], color.device.type == "cpu"):
-            torch.bmm(basis[part].unsqueeze(1), _rows(first, rest, ids[part], degree), out=color[part].unsqueeze(1))
+            torch.bmm(
+                basis[part].unsqueeze(1),
+                _rows(first, rest, ids[part], degree),
+                out=color[part].unsqueeze(1),
+            )
         color = offset(color)
         ctx.degree = degree
         ctx.save_for_backward(first, rest, unit, inverse_length, basis, color > 0, ids)
@@ -98,11 +144,15 @@ class CompiledColor(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, directions, first, rest, ids, degree):
-        directions, first, rest, ids = (tensor.contiguous() for tensor in (directions, first, rest, ids))
+        directions, first, rest, ids = (
+            tensor.contiguous() for tensor in (directions, first, rest, ids)
+        )
         if len(ids):
             lowest, highest = ids.aminmax()
             if lowest < 0 or highest >= len(first):
-                raise IndexError(f"ids are from {lowest} to {highest}; expected rows of {len(first)} Gaussians")
+                raise IndexError(
+                    f"ids are from {lowest} to {highest}; expected rows of {len(first)} Gaussians"
+                )
         colors = torch.empty_like(directions)
         _call_kernels(directions, first, rest, ids, degree, colors)
         ctx.degree = degree
@@ -119,44 +169,73 @@ class CompiledColor(torch.autograd.Function):
         of_first = zeros_like(first) if wanted[1] else None
         of_rest = zeros_like(rest) if wanted[2] else None
         _call_kernels(
-            directions, first, rest, ids, ctx.degree, colors,
-            grad_colors=grad.contiguous(), grad_directions=of_directions, grad_first=of_first, grad_rest=of_rest,
-        )  # fmt: skip
+            directions,
+            first,
+            rest,
+            ids,
+            ctx.degree,
+            colors,
+            grad_colors=grad.contiguous(),
+            grad_directions=of_directions,
+            grad_first=of_first,
+            grad_rest=of_rest,
+        )
         return of_directions, of_first, of_rest, None, None
 
 
 def zeros_like(coefficients: Tensor) -> Tensor:
-    """By NumPy, which takes memory that the system has zeroed: rows that are not seen are not written, nor paid for."""
+    """By NumPy, which takes memory that the system has zeroed: rows that are not seen are not
+    written, nor paid for."""
     return torch.from_numpy(np.zeros(coefficients.shape, np.float32))
 
 
 def _call_kernels(
-    directions: Tensor, first: Tensor, rest: Tensor, ids: Tensor, degree: int, colors: Tensor, **grads: Tensor | None
+    directions: Tensor,
+    first: Tensor,
+    rest: Tensor,
+    ids: Tensor,
+    degree: int,
+    colors: Tensor,
+    **grads: Tensor | None,
 ) -> None:
     task = KERNELS.structs["Colors"](
-        directions=directions, first=first, rest=rest, rest_row=3 * rest.shape[1], ids=ids, count=len(ids),
-        degree=degree, colors=colors, **grads,
-    )  # fmt: skip
+        directions=directions,
+        first=first,
+        rest=rest,
+        rest_row=3 * rest.shape[1],
+        ids=ids,
+        count=len(ids),
+        degree=degree,
+        colors=colors,
+        **grads,
+    )
     on_threads(len(ids) >= SEVERAL, KERNELS.library.pointsplat_color, task)
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, and a degree of 0 to 3."""
+    """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, and a degree of 0
+    to 3."""
     return torch.stack(basis_rows(directions.movedim(-1, 0), degree), dim=-1)
 
 
 def sh_to_color(
-    directions: Tensor, first: Tensor, rest: Tensor, degree: int, ids: Tensor, compiled: bool | None = None
+    directions: Tensor,
+    first: Tensor,
+    rest: Tensor,
+    degree: int,
+    ids: Tensor,
+    compiled: bool | None = None,
 ) -> Tensor:
     """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
 
     Args:
-        directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero direction sees
-            the basis at zero.
+        directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero
+            direction sees the basis at zero.
         first: (N, 3) constant SH coefficients.
         rest: (N, K - 1, 3) the others; K >= (degree + 1)^2, what is beyond is ignored.
         degree: 0 to 3.
-        ids: (M,) int64, each at most once: the row of the coefficients that each direction belongs to.
+        ids: (M,) int64, each at most once: the row of the coefficients that each direction belongs
+            to.
         compiled: as for :func:`~pointsplat_ns.rasterization`.
 
     Returns:
@@ -167,12 +246,15 @@ def sh_to_color(
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"sh_degree is {degree}; expected 0 to 3")
-    used, stored = (degree + 1) ** 2, 1 + rest.shape[1]
+    used = (degree + 1) ** 2
+    stored = 1 + rest.shape[1]
     if stored < used:
         raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")
     if KERNELS.usable_for(compiled, directions, first, rest):
         # a constant has no direction
-        return CompiledColor.apply(directions if degree else directions.detach(), first, rest, ids, degree)
+        return CompiledColor.apply(
+            directions if degree else directions.detach(), first, rest, ids, degree
+        )
     if degree == 0:
         return offset(SH_C0 * first.index_select(0, ids)).clamp_min(0.0)
     return Color.apply(directions, first, rest, ids, degree)

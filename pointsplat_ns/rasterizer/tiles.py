@@ -1,7 +1,8 @@
 """The tiles that each Gaussian touches, exactly, in drawing order.
 
-A Gaussian is paired with a tile only if its own 1/255 ellipse meets the box of the tile's pixel centres: over each row
-of tiles the ellipse's extent in x is known in closed form, and the tiles that it covers are an interval.
+A Gaussian is paired with a tile only if its own 1/255 ellipse meets the box of the tile's pixel
+centres: over each row of tiles the ellipse's extent in x is known in closed form, and the tiles
+that it covers are an interval.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from pointsplat_ns.system.kernels import KERNELS
 
 
 class Footprints:
-    """The ellipses of projected Gaussians within which they are drawn, in depth order, found in torch
-    (:mod:`~pointsplat_ns.rasterizer.ellipses`) or by compiled kernels.
+    """The ellipses of projected Gaussians within which they are drawn, in depth order, found in
+    torch (:mod:`~pointsplat_ns.rasterizer.ellipses`) or by compiled kernels.
 
     Args:
         seen: M Gaussians.
@@ -44,28 +45,35 @@ class Footprints:
         self._ellipses = self._engine.ellipses_of(*shapes, order, self.grid)
 
     def regions(self, most_pairs: int) -> list[tuple[int, int]]:
-        """The image as few bands of rows of tiles, the first and one past the last, of at most about ``most_pairs``
-        pairs each, by a bound on their number. A row is not divided."""
-        rows, columns = self.grid.rows, self.grid.columns
+        """The image as few bands of rows of tiles, the first and one past the last, of at most
+        about ``most_pairs`` pairs each, by a bound on their number. A row is not divided."""
+        rows = self.grid.rows
+        columns = self.grid.columns
         boxes = self._ellipses.boxes
         if len(boxes) * rows * columns <= most_pairs:
             return [(0, rows)]
         row0, row1, column0, column1 = boxes.long().unbind(1)
-        heights, widths = (row1 - row0 + 1).clamp_min_(0), (column1 - column0 + 1).clamp_min_(0)
+        heights = (row1 - row0 + 1).clamp_min_(0)
+        widths = (column1 - column0 + 1).clamp_min_(0)
         if int((heights * widths).sum()) <= most_pairs:  # boxes around the ellipses
             return [(0, rows)]
         steps = torch.zeros(rows + 1, dtype=torch.int64, device=boxes.device)
         steps.index_add_(0, row0, widths).index_add_(0, row0 + heights, -widths)
-        bands, top, total = [], 0, 0
+        bands = []
+        top = 0
+        total = 0
         for row, pairs in enumerate(torch.cumsum(steps, 0)[:-1].tolist()):
             if row > top and total + pairs > most_pairs:
                 bands.append((top, row))
-                top, total = row, 0
+                top = row
+                total = 0
             total += pairs
         return [*bands, (top, rows)]
 
     @torch.no_grad()
     def tiles(self, top: int = 0, bottom: int | None = None) -> TileList:
-        """Pair Gaussians with the tiles of the rows from ``top`` on before ``bottom``, by default of all, and sort the
-        pairs by tile, then depth, then row of the input."""
-        return self._engine.pairs_of(self._ellipses, self.grid, top, self.grid.rows if bottom is None else bottom)
+        """Pair Gaussians with the tiles of the rows from ``top`` on before ``bottom``, by default
+        of all, and sort the pairs by tile, then depth, then row of the input."""
+        return self._engine.pairs_of(
+            self._ellipses, self.grid, top, self.grid.rows if bottom is None else bottom
+        )

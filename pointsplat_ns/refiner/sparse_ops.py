@@ -1,7 +1,9 @@
-"""The sparse operations of the network: permutation, maximum and mean per cluster, submanifold convolution, pieces.
+"""The sparse operations of the network: permutation, maximum and mean per cluster, submanifold
+convolution, pieces.
 
-The first and the fourth have their own backward. Autograd's backward of a gather accumulates row by row; for a
-permutation or distinct targets a gather is enough. No function allocates more than a few times [N, C].
+The first and the fourth have their own backward. Autograd's backward of a gather accumulates row by
+row; for a permutation or distinct targets a gather is enough. No function allocates more than a few
+times [N, C].
 """
 
 from __future__ import annotations
@@ -17,8 +19,8 @@ Order = tuple[Tensor, Tensor]
 """The order of points along a curve and its inverse, (N,) int64 each."""
 
 KernelMap = list[tuple[Tensor, Tensor]]
-"""Pairs of neighbouring cells, from ``structure.neighbour_pairs``: for each offset in one half of the kernel, the cells
-(i, j) with j at i + offset, (P,) int64 each."""
+"""Pairs of neighbouring cells, from ``structure.neighbour_pairs``: for each offset in one half of
+the kernel, the cells (i, j) with j at i + offset, (P,) int64 each."""
 
 
 class _Permute(Function):
@@ -47,7 +49,8 @@ def segment_max(
     cluster: Tensor,  # [N] int64 in [0, size), each value at least once
     size: int,
 ) -> Tensor:
-    """Maximum over the rows of each cluster; the gradient of a tie is divided evenly. # [size, C]"""
+    """Maximum over the rows of each cluster; the gradient of a tie is divided evenly. # [size,
+    C]"""
     index = cluster[:, None].expand_as(x)
     return x.new_zeros(size, x.shape[1]).scatter_reduce(0, index, x, "amax", include_self=False)
 
@@ -73,7 +76,8 @@ class _SubmanifoldConv(Function):
         if grad_weight is not None:
             torch.mm(x.T, grad, out=grad_weight[13])
         for k, i, j in _parts(ctx.kernel_map, x):
-            grad_i, grad_j = grad.index_select(0, i), grad.index_select(0, j)
+            grad_i = grad.index_select(0, i)
+            grad_j = grad.index_select(0, j)
             if grad_weight is not None:
                 grad_weight[14 + k].addmm_(x.index_select(0, j).T, grad_i)
                 grad_weight[12 - k].addmm_(x.index_select(0, i).T, grad_j)
@@ -94,11 +98,13 @@ def _parts(kernel_map: KernelMap, x: Tensor) -> Iterator[tuple[int, Tensor, Tens
 
 def submanifold_conv(
     x: Tensor,  # [M, Cin] one row per occupied cell
-    weight: Tensor,  # [27, Cin, Cout] taps in the order of (dx, dy, dz) from (-1, -1, -1), dz fastest
+    # [27, Cin, Cout] taps in the order of (dx, dy, dz) from (-1, -1, -1), dz fastest
+    weight: Tensor,
     kernel_map: KernelMap,
 ) -> Tensor:
     """3x3x3 convolution on the occupied cells alone: ``out[p] = sum_d x[p + d] @ weight[d]`` over
-    existing ``p + d``. Only those are multiplied; each tap holds one [P, C] gather at a time. # [M, Cout]"""
+    existing ``p + d``. Only those are multiplied; each tap holds one [P, C] gather at a time. # [M,
+    Cout]"""
     return _SubmanifoldConv.apply(x, weight, kernel_map)
 
 
@@ -117,7 +123,8 @@ MAX_ELEMENTS = 2**20
 
 
 def rows_at_a_time(width: int, multiple: int = 1) -> int:
-    """Number of rows of ``width`` elements that a CPU computes in one call: a positive multiple of ``multiple``."""
+    """Number of rows of ``width`` elements that a CPU computes in one call: a positive multiple of
+    ``multiple``."""
     return max(1, MAX_ELEMENTS // (width * multiple)) * multiple
 
 
@@ -144,7 +151,9 @@ def by_patches(
     full = len(x) // patch * patch  # points in whole patches
     if order is not None:
         x = permute(x, *order)
-    whole = x if full == len(x) else x[:full]  # a slice of everything would cost a copy in the backward pass
+    whole = (
+        x if full == len(x) else x[:full]
+    )  # a slice of everything would cost a copy in the backward pass
     out = by_rows(function, whole, rows_at_a_time(width, patch))
     if full < len(x):
         out = torch.cat([out, function(x[len(x) - patch :])[full - len(x) :]])

@@ -1,7 +1,9 @@
-"""Where the Gaussians of a scene are: its unit cube, and the grids and curves by which the network finds neighbours.
+"""Where the Gaussians of a scene are: its unit cube, and the grids and curves by which the network
+finds neighbours.
 
-All of it follows from positions alone. Points are stored along the first curve of the configuration, so that the points
-of a cell are consecutive at every level, and neighbours are close in memory.
+All of it follows from positions alone. Points are stored along the first curve of the
+configuration, so that the points of a cell are consecutive at every level, and neighbours are close
+in memory.
 """
 
 from __future__ import annotations
@@ -38,10 +40,11 @@ class UnitCube:
 def unit_cube(means: Tensor) -> UnitCube:
     """The unit cube of at least one finite position (N, 3), scene units.
 
-    The core of the scene is the box of its positions without the outermost 1 % at each end of each axis (at least one
-    position, from 8 positions on). The box of all positions is cut to the core plus half of the core's longest side in
-    each direction. A scene without outliers keeps its full extent; an outlier at most doubles it. The cube has the
-    centre and the longest side of the cut box, or side 1 where that is zero.
+    The core of the scene is the box of its positions without the outermost 1 % at each end of each
+    axis (at least one position, from 8 positions on). The box of all positions is cut to the core
+    plus half of the core's longest side in each direction. A scene without outliers keeps its full
+    extent; an outlier at most doubles it. The cube has the centre and the longest side of the cut
+    box, or side 1 where that is zero.
     """
     axes = means.detach().T.contiguous()  # [3, N]
     n = axes.shape[1]
@@ -50,38 +53,47 @@ def unit_cube(means: Tensor) -> UnitCube:
     core_low, core_high = (axes.kthvalue(k, dim=1).values.double() for k in (trim + 1, n - trim))
     reach = 0.5 * (core_high - core_low).max()
     if reach > 0:
-        low, high = torch.maximum(low, core_low - reach), torch.minimum(high, core_high + reach)
+        low = torch.maximum(low, core_low - reach)
+        high = torch.minimum(high, core_high + reach)
     extent = (high - low).max()
-    return UnitCube(low + (high - low) / 2, torch.where(extent > 0, extent, torch.ones_like(extent)))
+    return UnitCube(
+        low + (high - low) / 2, torch.where(extent > 0, extent, torch.ones_like(extent))
+    )
 
 
 def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
     """Codes (N,) in ``[0, 8**bits)`` along each named space-filling curve, int64.
 
-    Points that are close along a curve are close in space, so a patch of consecutive points is a neighbourhood. The
-    code of a coarser cell is the code of any of its points without the last three bits per halving, so one sort serves
-    all grids of the network.
+    Points that are close along a curve are close in space, so a patch of consecutive points is a
+    neighbourhood. The code of a coarser cell is the code of any of its points without the last
+    three bits per halving, so one sort serves all grids of the network.
 
     Args:
         coords: integer coordinates, each at least 0 and below ``2**bits``.  # [N, 3] int64
         bits: bits per axis, at most 20.
-        curves: ``z`` for the z-order (Morton) curve, which interleaves the bits of the three axes; ``hilbert`` for the
-            Hilbert curve, whose consecutive cells always share a face; or either with ``-trans``: the same curve with x
-            and y exchanged.
+        curves: ``z`` for the z-order (Morton) curve, which interleaves the bits of the three axes;
+            ``hilbert`` for the Hilbert curve, whose consecutive cells always share a face; or
+            either with ``-trans``: the same curve with x and y exchanged.
     """
     codes = []
     for curve in curves:
         x, y, z = coords.unbind(1)
         axes = (y, x, z) if curve.endswith("-trans") else (x, y, z)
-        codes.append(interleave(*map(spread_bits, _gray_axes(axes, bits) if curve.startswith("hilbert") else axes)))
+        codes.append(
+            interleave(
+                *map(spread_bits, _gray_axes(axes, bits) if curve.startswith("hilbert") else axes)
+            )
+        )
     return codes
 
 
 def _gray_axes(coords: tuple[Tensor, Tensor, Tensor], bits: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Three numbers (N,) each, whose interleaved bits are the Hilbert codes of coordinates (N,) each.
+    """Three numbers (N,) each, whose interleaved bits are the Hilbert codes of coordinates (N,)
+    each.
 
-    At each bit, a mirror or an exchange of axes applies to all lower bits. Then the bits are Gray-coded. Source: J.
-    Skilling, "Programming the Hilbert curve", AIP Conference Proceedings 707 (2004).
+    At each bit, a mirror or an exchange of axes applies to all lower bits. Then the bits are
+    Gray-coded. Source: J. Skilling, "Programming the Hilbert curve", AIP Conference Proceedings 707
+    (2004).
     """
     axes = list(coords)
     for bit in range(bits - 1, 0, -1):
@@ -106,7 +118,7 @@ HALF_KERNEL = [
     for dy in (-1, 0, 1)
     for dz in (-1, 0, 1)
     if (dx, dy, dz) > (0, 0, 0)
-]  # fmt: skip
+]
 """The 13 offsets of a 3x3x3 kernel that come after the centre; the other 13 are their negatives."""
 
 
@@ -146,13 +158,16 @@ def structure_key(config: RefinerConfig) -> tuple:
 
 @torch.no_grad()
 def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
-    """Levels of a scene of at least one usable Gaussian, by ``grid``, ``strides`` and ``curves`` of the configuration.
+    """Levels of a scene of at least one usable Gaussian, by ``grid``, ``strides`` and ``curves`` of
+    the configuration.
 
-    Points with equal finest codes (1 / 2^16 of the cube) are ordered by all their parameters, so that the result does
-    not depend on the order of the Gaussians.
+    Points with equal finest codes (1 / 2^16 of the cube) are ordered by all their parameters, so
+    that the result does not depend on the order of the Gaussians.
     """
     cube = unit_cube(scene.means)
-    fixed_bits = 7  # per axis, by which the finest code splits a cell of a fixed grid: a grid of 512 needs 16 in all
+    # per axis, by which the finest code splits a cell of a fixed grid: a grid of 512 needs 16 in
+    # all
+    fixed_bits = 7
     units = 2**FINE_BITS if config.grid is None else config.grid << fixed_bits
     fine = ((cube.positions(scene.means) + 0.5) * units).long().clamp_(0, units - 1)
     codes = curve_codes(fine, FINE_BITS, config.curves)
@@ -180,30 +195,40 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
             )
         )
         if cluster is not None and next_first is not None:
-            first, depths = first.index_select(0, next_first), depths.index_select(0, next_first)
+            first = first.index_select(0, next_first)
+            depths = depths.index_select(0, next_first)
             orders = [_coarser_order(one, cluster) for one, _ in orders]
     return Structure(cube, order, _invert(order), levels, structure_key(config))
 
 
 def neighbour_pairs(cells: Tensor) -> KernelMap:
-    """Existing neighbours of distinct cells in the 3x3x3 kernel, of integer coordinates (M, 3) from 0 to 2^20, at least
-    one.
+    """Existing neighbours of distinct cells in the 3x3x3 kernel, of integer coordinates (M, 3) from
+    0 to 2^20, at least one.
 
     Returns:
         per offset of :data:`HALF_KERNEL`, the indices ``i`` and ``j`` of all pairs with
         ``cells[j] == cells[i] + offset``, ``i`` increasing.  # [P], [P] int64
     """
-    m, side = len(cells), int(cells.max()) + 3  # two empty cells after the last of each axis: no offset wraps around
+    # two empty cells after the last of each axis: no offset wraps around
+    m = len(cells)
+    side = int(cells.max()) + 3
     keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
-    keys, index = keys.to(torch.int32 if side**3 < 2**31 else torch.int64).sort()  # half the width takes half the time
+    keys, index = keys.to(
+        torch.int32 if side**3 < 2**31 else torch.int64
+    ).sort()  # half the width takes half the time
     following = (keys[1:] == keys[:-1] + 1).nonzero()[:, 0]  # offset (0, 0, 1)
     found = [index.index_select(0, following)]  # index of the offset times M, plus i
     partners = [index.index_select(0, following + 1)]
-    # The three cells of another column (dx, dy) are consecutive in the sorted keys, so one search finds them all. Its
-    # targets are sorted too, which halves its time.
-    columns = [(i, (dx * side + dy) * side - 1) for i, (dx, dy, dz) in enumerate(HALF_KERNEL) if dz == -1]
-    numbers, steps = torch.tensor(columns, device=keys.device, dtype=torch.int64)[:, :, None].unbind(1)
-    numbered, target = (index + numbers * m).flatten(), (keys + steps.to(keys.dtype)).flatten()
+    # The three cells of another column (dx, dy) are consecutive in the sorted keys, so one search
+    # finds them all. Its targets are sorted too, which halves its time.
+    columns = [
+        (i, (dx * side + dy) * side - 1) for i, (dx, dy, dz) in enumerate(HALF_KERNEL) if dz == -1
+    ]
+    numbers, steps = torch.tensor(columns, device=keys.device, dtype=torch.int64)[
+        :, :, None
+    ].unbind(1)
+    numbered = (index + numbers * m).flatten()
+    target = (keys + steps.to(keys.dtype)).flatten()
     place = torch.searchsorted(keys, target)
     keys = torch.cat([keys, keys.new_full((1,), torch.iinfo(keys.dtype).max)])
     for dz in range(3):
@@ -211,7 +236,8 @@ def neighbour_pairs(cells: Tensor) -> KernelMap:
         at = hit.nonzero()[:, 0]
         found.append(numbered.index_select(0, at).add_(dz * m))
         partners.append(index.index_select(0, place.index_select(0, at)))
-        place, target = place.add_(hit), target.add_(1)
+        place = place.add_(hit)
+        target = target.add_(1)
     numbered, order = torch.cat(found).sort()
     j = torch.cat(partners).index_select(0, order)
     counts = torch.bincount(numbered // m, minlength=len(HALF_KERNEL)).tolist()
@@ -219,9 +245,9 @@ def neighbour_pairs(cells: Tensor) -> KernelMap:
 
 
 def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices of the scene sorted by code, with ties sorted by the parameters; and for each code the position, from 1,
-    of the highest bit that differs from the previous code. With ``s`` bits dropped per axis, a new cell begins where
-    this position exceeds ``3 * s``. # [N], [N]"""
+    """Indices of the scene sorted by code, with ties sorted by the parameters; and for each code
+    the position, from 1, of the highest bit that differs from the previous code. With ``s`` bits
+    dropped per axis, a new cell begins where this position exceeds ``3 * s``. # [N], [N]"""
     codes, order = codes.sort(stable=True)
     depths = torch.frexp((codes[1:] ^ codes[:-1]).double()).exponent
     depths = torch.cat([depths.new_full((1,), 64), depths])
@@ -240,9 +266,11 @@ def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _adaptive_shift(depths: Tensor) -> int:
-    """Bits per axis to drop from the finest codes, as many as possible with one or two positions in a cell, so that
-    neighbours are in adjacent cells."""
-    cells = torch.bincount(depths, minlength=65).flip(0).cumsum(0).flip(0).tolist()  # of at least that many bits
+    """Bits per axis to drop from the finest codes, as many as possible with one or two positions in
+    a cell, so that neighbours are in adjacent cells."""
+    cells = (
+        torch.bincount(depths, minlength=65).flip(0).cumsum(0).flip(0).tolist()
+    )  # of at least that many bits
     for shift in range(FINE_BITS, 0, -1):
         if cells[3 * shift + 1] >= 0.6 * cells[1]:  # occupied cells per distinct position
             return shift
@@ -250,14 +278,15 @@ def _adaptive_shift(depths: Tensor) -> int:
 
 
 def _runs(depths: Tensor, shift: int) -> tuple[Tensor, Tensor]:
-    """Cell of each place [M] and first place of each cell [R], with ``shift`` bits per axis dropped."""
+    """Cell of each place [M] and first place of each cell [R], with ``shift`` bits per axis
+    dropped."""
     starts = depths > 3 * shift
     return starts.cumsum(0) - 1, starts.nonzero()[:, 0]
 
 
 def _coarser_order(along: Tensor, cluster: Tensor) -> Order:
-    """The order of the next level. A curve visits all points of a cell in a row, so it visits the cells in
-    the order of their first points."""
+    """The order of the next level. A curve visits all points of a cell in a row, so it visits the
+    cells in the order of their first points."""
     cells = cluster.index_select(0, along)
     starts = torch.ones_like(cells, dtype=torch.bool)
     torch.ne(cells[1:], cells[:-1], out=starts[1:])
@@ -266,4 +295,6 @@ def _coarser_order(along: Tensor, cluster: Tensor) -> Order:
 
 
 def _invert(order: Tensor) -> Tensor:
-    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device, dtype=torch.int64))
+    return torch.empty_like(order).scatter_(
+        0, order, torch.arange(len(order), device=order.device, dtype=torch.int64)
+    )

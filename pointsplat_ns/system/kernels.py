@@ -1,8 +1,9 @@
-"""Functions of the C++ files of this package: built when the package is installed, and called on several threads.
+"""Functions of the C++ files of this package: built when the package is installed, and called on
+several threads.
 
-Structs and functions are read from the files and their headers, so that nothing is declared twice. Files share what is
-between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs of numbers, arrays, pointers and earlier
-structs.
+Structs and functions are read from the files and their headers, so that nothing is declared twice.
+Files share what is between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs
+of numbers, arrays, pointers and earlier structs.
 """
 
 from __future__ import annotations
@@ -37,21 +38,21 @@ _NUMBERS = {
 
 
 class Pointer:
-    """Type of a pointer, which takes contiguous tensors on the CPU, of one dtype or of any, structs, addresses and
-    None."""
+    """Type of a pointer, which takes contiguous tensors on the CPU, of one dtype or of any,
+    structs, addresses and None."""
 
     def __init__(self, dtype: torch.dtype | None):
         self.dtype = dtype
 
     def address(self, value: Any) -> int | None:
-        """The address of a tensor; None and addresses as they are. Raises TypeError if the tensor has another dtype or
-        device, or is not contiguous."""
+        """The address of a tensor; None and addresses as they are. Raises TypeError if the tensor
+        has another dtype or device, or is not contiguous."""
         if not isinstance(value, torch.Tensor):
             return value
         if self.dtype not in (None, value.dtype) or not value.is_cpu or not value.is_contiguous():
             raise TypeError(
-                f"tensor of {value.dtype} on {value.device} with strides {value.stride()}; expected {self.dtype} on "
-                "the CPU, contiguous"
+                f"tensor of {value.dtype} on {value.device} with strides {value.stride()}; "
+                f"expected {self.dtype} on the CPU, contiguous"
             )
         return value.data_ptr()
 
@@ -63,7 +64,8 @@ class Pointer:
 
 
 class Struct(ctypes.Structure):
-    """A struct of a C++ file. :meth:`fill` sets pointers to what :class:`Pointer` takes, and keeps tensors alive."""
+    """A struct of a C++ file. :meth:`fill` sets pointers to what :class:`Pointer` takes, and keeps
+    tensors alive."""
 
     __slots__ = ("kept",)
     pointers: ClassVar[dict[str, Pointer]] = {}
@@ -73,8 +75,8 @@ class Struct(ctypes.Structure):
         self.fill(**values)
 
     def fill(self, **values: Any) -> None:
-        """Set fields. Raises AttributeError if there is no such field, and TypeError if a value does not fit its
-        type."""
+        """Set fields. Raises AttributeError if there is no such field, and TypeError if a value
+        does not fit its type."""
         self.kept.update(values)
         pointers = self.pointers
         for name, value in values.items():
@@ -82,45 +84,72 @@ class Struct(ctypes.Structure):
 
 
 def structs_of(text: str) -> dict[str, type[Struct]]:
-    """The structs that the text of a C++ file shares, by name. Raises ValueError if a field is of an unknown type."""
+    """The structs that the text of a C++ file shares, by name. Raises ValueError if a field is of
+    an unknown type."""
     found: dict[str, type[Struct]] = {}
     for name, body in re.findall(r"^struct (\w+) \{\n(.*?)^\};", _shared(text), re.M | re.S):
-        declared = [each for statement in body.split(";") if statement.strip() for each in _declared(statement, found)]
+        declared = [
+            each
+            for statement in body.split(";")
+            if statement.strip()
+            for each in _declared(statement, found)
+        ]
         pointers = {field: kind for field, kind in declared if isinstance(kind, Pointer)}
-        fields = [(field, ctypes.c_void_p if field in pointers else kind) for field, kind in declared]
-        found[name] = type(name, (Struct,), {"__slots__": (), "pointers": pointers, "_fields_": fields})
+        fields = [
+            (field, ctypes.c_void_p if field in pointers else kind) for field, kind in declared
+        ]
+        found[name] = type(
+            name, (Struct,), {"__slots__": (), "pointers": pointers, "_fields_": fields}
+        )
     return found
 
 
 def functions_of(text: str, structs: dict[str, type[Struct]]) -> dict[str, tuple[Any, list[Any]]]:
-    """Type of the result and types of the arguments of the functions that the text of a C++ file shares, by name, given
-    its structs. Raises ValueError if a type is unknown."""
+    """Type of the result and types of the arguments of the functions that the text of a C++ file
+    shares, by name, given its structs. Raises ValueError if a type is unknown."""
     found = {}
     for result, name, parameters in re.findall(r"^(\w+) (\w+)\(([^)]*)\) \{", _shared(text), re.M):
-        kinds = [kind for each in filter(None, parameters.split(",")) for _, kind in _declared(each, structs)]
+        kinds = [
+            kind
+            for each in filter(None, parameters.split(","))
+            for _, kind in _declared(each, structs)
+        ]
         found[name] = None if result == "void" else _NUMBERS[result][0], kinds
     return found
 
 
 def _shared(text: str) -> str:
     """What a C++ file shares, without comments."""
-    return re.sub(r"//.*", "", "\n".join(re.findall(r'^extern "C" \{\n(.*?)^\}  // extern "C"', text, re.M | re.S)))
+    return re.sub(
+        r"//.*",
+        "",
+        "\n".join(re.findall(r'^extern "C" \{\n(.*?)^\}  // extern "C"', text, re.M | re.S)),
+    )
 
 
 def _declared(statement: str, structs: dict[str, type[Struct]]) -> list[tuple[str, Any]]:
-    """Names and types that a statement such as ``const float *a, b[3]`` declares; arrays are flat."""
+    """Names and types that a statement such as ``const float *a, b[3]`` declares; arrays are
+    flat."""
     found: list[tuple[str, Any]] = []
     base, declarators = re.sub(r"^\s*(const )?", "", statement).split(None, 1)
     if base.endswith("*"):
-        base, declarators = base[:-1], f"*{declarators}"
+        base = base[:-1]
+        declarators = f"*{declarators}"
     number: Any
     number, dtype = (structs[base], None) if base in structs else _NUMBERS.get(base, (None, None))
     for declarator in declarators.split(","):
         parts = re.fullmatch(r"\s*(\*?)\s*(\w+)((?:\[\d+\])*)\s*", declarator)
         if not parts or number is None:
-            raise ValueError(f"{statement!r}: not a declaration of numbers, arrays, pointers or structs")
+            raise ValueError(
+                f"{statement!r}: not a declaration of numbers, arrays, pointers or structs"
+            )
         sizes = [int(size) for size in re.findall(r"\d+", parts[3])]
-        found.append((parts[2], Pointer(dtype) if parts[1] else number * math.prod(sizes) if sizes else number))
+        found.append(
+            (
+                parts[2],
+                Pointer(dtype) if parts[1] else number * math.prod(sizes) if sizes else number,
+            )
+        )
     return found
 
 
@@ -129,8 +158,8 @@ SEVERAL = 4000
 
 
 class Kernels:
-    """Functions of the C++ files that are faster than torch. All are used or none, because results would else be
-    rounded by the one here and by torch there.
+    """Functions of the C++ files that are faster than torch. All are used or none, because results
+    would else be rounded by the one here and by torch there.
 
     Args:
         path: their library, which an installation builds.
@@ -154,7 +183,8 @@ class Kernels:
         library = ctypes.CDLL(str(self._path))
         for name, (result, parameters) in functions_of(self._text, self.structs).items():
             function = getattr(library, name)
-            function.restype, function.argtypes = result, parameters
+            function.restype = result
+            function.argtypes = parameters
         return library
 
     @functools.cached_property
@@ -165,14 +195,19 @@ class Kernels:
         elif not self._path.is_file():
             others = any(self._path.parent.glob("kernels.*.so"))
             found = "they were built from other sources" if others else "they were not built"
-            why = f"{found}; where there is a C++ compiler, installing builds them (in a clone: pip install -e .)"
+            why = (
+                f"{found}; where there is a C++ compiler, installing builds them (in a clone: pip "
+                "install -e .)"
+            )
         else:
             try:
                 ctypes.CDLL(str(self._path))
                 return ""
             except OSError as error:
                 why = " ".join(str(error).split())
-        logger.warning("compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", why)
+        logger.warning(
+            "compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", why
+        )
         return why
 
     def usable(self, wanted: bool | None) -> bool:
@@ -181,12 +216,17 @@ class Kernels:
             return False
         why = self.why_missing
         if why and wanted:
-            warnings.warn(f"torch computes what kernels were asked for: {why}", stacklevel=1)  # one text is shown once
+            warnings.warn(
+                f"torch computes what kernels were asked for: {why}", stacklevel=1
+            )  # one text is shown once
         return not why
 
     def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:
-        """Whether to use them for these tensors: float32, on a CPU; ``wanted`` as for :meth:`usable`."""
-        suited = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
+        """Whether to use them for these tensors: float32, on a CPU; ``wanted`` as for
+        :meth:`usable`."""
+        suited = all(
+            tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors
+        )
         return suited and self.usable(wanted)
 
 
@@ -194,11 +234,11 @@ KERNELS = Kernels(library_path())
 
 
 def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object) -> None:
-    """Call a function of a C++ file in :func:`~pointsplat_ns.system.threads.most_threads` threads, or in one if more
-    are not worth it.
+    """Call a function of a C++ file in :func:`~pointsplat_ns.system.threads.most_threads` threads,
+    or in one if more are not worth it.
 
-    The last parameter of the function points to the number of pieces of work that threads have taken. ctypes lets go of
-    Python during the call.
+    The last parameter of the function points to the number of pieces of work that threads have
+    taken. ctypes lets go of Python during the call.
     """
     taken = ctypes.c_int64(0)
     call = functools.partial(function, *arguments, ctypes.byref(taken))

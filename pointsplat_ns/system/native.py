@@ -16,11 +16,12 @@ IS_X86 = platform.machine().lower() in ("x86_64", "amd64")
 
 FLAGS = (
     *("-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"),
-    # Eight numbers at once, multiplied and added in one rounding: Intel's processors since 2013, AMD's since 2015. With
-    # AVX-512 the kernels are no faster, and give the same bits.
+    # Eight numbers at once, multiplied and added in one rounding: Intel's processors since 2013,
+    # AMD's since 2015. With AVX-512 the kernels are no faster, and give the same bits.
     *(("-mavx2", "-mfma") if IS_X86 else ()),
 )
-"""Flags of the compiler: for any machine of this architecture, as wheels run on others than those that build them."""
+"""Flags of the compiler: for any machine of this architecture, as wheels run on others than those
+that build them."""
 
 
 def cpp_files(pattern: str = "*.cpp") -> list[Path]:
@@ -29,8 +30,8 @@ def cpp_files(pattern: str = "*.cpp") -> list[Path]:
 
 
 def library_path() -> Path:
-    """The library of the C++ files. Its name has a hash of them and of the flags, so one of other sources is not taken
-    for it; the dot in it keeps Python from taking it for a module."""
+    """The library of the C++ files. Its name has a hash of them and of the flags, so one of other
+    sources is not taken for it; the dot in it keeps Python from taking it for a module."""
     key = hashlib.sha256(" ".join((platform.system(), platform.machine(), *FLAGS)).encode())
     for path in (*cpp_files(), *cpp_files("*.h")):
         name = path.relative_to(Path(__file__).parents[1]).as_posix()

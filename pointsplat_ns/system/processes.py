@@ -1,7 +1,8 @@
 """Several processes that train one network: their ranks, and what they exchange.
 
-In a single process every function here changes nothing. The processes are those of ``torch.distributed``, started by
-``torchrun`` or by nerfstudio, with the backend nccl on GPUs and gloo on CPUs.
+In a single process every function here changes nothing. The processes are those of
+``torch.distributed``, started by ``torchrun`` or by nerfstudio, with the backend nccl on GPUs and
+gloo on CPUs.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from pointsplat_ns.errors import PointSplatError
 
 
 def torchrun_rank() -> tuple[int, int]:
-    """Rank of this process and number of processes that ``torchrun`` started together; 0 and 1 without it."""
+    """Rank of this process and number of processes that ``torchrun`` started together; 0 and 1
+    without it."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return 0, 1
     return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
@@ -32,8 +34,8 @@ def local_rank() -> int:
 
 
 def connect_torchrun(backend: Literal["gloo", "nccl"] = "gloo") -> None:
-    """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a second time. The
-    backend is nccl where each process has a GPU of its own."""
+    """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a
+    second time. The backend is nccl where each process has a GPU of its own."""
     if torchrun_rank()[1] == 1 or dist.is_initialized():
         return
     if backend == "nccl":
@@ -54,7 +56,8 @@ def rank() -> int:
 
 
 def any_rank(flag: bool, device: torch.device | str) -> bool:
-    """Whether ``flag`` is set in any process. All processes must call this, each with its own device."""
+    """Whether ``flag`` is set in any process. All processes must call this, each with its own
+    device."""
     if world_size() == 1:
         return flag
     count = torch.tensor([float(flag)], device=device, dtype=torch.float32)
@@ -86,7 +89,9 @@ def by_first(work: Callable[[], object]) -> None:
     try:
         text = gathered([failure and (str(failure) or type(failure).__name__)])[0]
     except RuntimeError as error:  # of the connection
-        raise failure or PointSplatError("another process ended; the same command resumes") from error
+        raise failure or PointSplatError(
+            "another process ended; the same command resumes"
+        ) from error
     if failure is not None:
         raise failure
     if text:
@@ -103,7 +108,8 @@ def share_state(module: nn.Module) -> None:
 
 @torch.no_grad()
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Average gradients over processes. With several, a parameter without a gradient in any of them gets zeros."""
+    """Average gradients over processes. With several, a parameter without a gradient in any of them
+    gets zeros."""
     parameters = list(parameters)
     if world_size() == 1 or not parameters:
         return
@@ -111,5 +117,7 @@ def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
     flat = torch.cat([grad.reshape(-1) for grad in grads])
     dist.all_reduce(flat)
     flat.mul_(1.0 / world_size())
-    for p, grad, mean in zip(parameters, grads, flat.split([g.numel() for g in grads]), strict=True):
+    for p, grad, mean in zip(
+        parameters, grads, flat.split([g.numel() for g in grads]), strict=True
+    ):
         p.grad = grad.copy_(mean.view_as(grad))

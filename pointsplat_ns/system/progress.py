@@ -25,11 +25,13 @@ def within(whole: str, progress: Progress) -> Progress:
 
 @contextmanager
 def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
-    """A bar in the terminal or notebook, with an estimate of the time left; it is erased at the end. Elsewhere, as in a
-    log file, a line from time to time, such as ``[1:30] merging: 45 %, about 1:50 left``: minutes and seconds since the
-    beginning, and what is left of the task at hand.
+    """A bar in the terminal or notebook, with an estimate of the time left; it is erased at the
+    end. Elsewhere, as in a log file, a line from time to time, such as ``[1:30] merging: 45 %,
+    about 1:50 left``: minutes and seconds since the beginning, and what is left of the task at
+    hand.
 
-    True shows a bar or writes lines, on standard error; False shows nothing; a function is returned as it is.
+    True shows a bar or writes lines, on standard error; False shows nothing; a function is returned
+    as it is.
     """
     if callable(progress):
         yield progress
@@ -41,7 +43,12 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
     console = Console(stderr=True)
     if not console.is_jupyter and (console.is_dumb_terminal or not console.is_terminal):
         yield _lines(console.file)
@@ -62,7 +69,9 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
 def _lines(stream: IO[str]) -> Progress:
     """Writes what is being done to ``stream``, every 30 seconds."""
     start = written = time.monotonic()
-    begun: dict[str, tuple[float, float]] = {}  # when each task was first heard of, and what was done of it by then
+    begun: dict[
+        str, tuple[float, float]
+    ] = {}  # when each task was first heard of, and what was done of it by then
 
     def show(what: str, share: float) -> None:
         nonlocal written
@@ -70,11 +79,17 @@ def _lines(stream: IO[str]) -> Progress:
         start_of_task, before = begun.setdefault(what, (now, share))
         if now - written < 30.0:
             return
-        written, gained, left = now, share - before, ""
+        written = now
+        gained = share - before
+        left = ""
         if gained > 0 and share < 1:
             left = f", about {_clock((now - start_of_task) * (1 - share) / gained)} left"
         with suppress(OSError, ValueError):  # nobody reads any more: the work continues
-            print(f"[{_clock(now - start)}] {what}: {100 * share:.0f} %{left}", file=stream, flush=True)
+            print(
+                f"[{_clock(now - start)}] {what}: {100 * share:.0f} %{left}",
+                file=stream,
+                flush=True,
+            )
 
     return show
 
@@ -85,7 +100,9 @@ def _clock(seconds: float) -> str:
     return f"{minutes}:{rest:02d}"
 
 
-def tracked(items: Iterable[Item], what: str, total: int, progress: bool | Progress = True) -> Iterator[Item]:
+def tracked(
+    items: Iterable[Item], what: str, total: int, progress: bool | Progress = True
+) -> Iterator[Item]:
     """Iterate over the items, with a bar that shows how many of ``total`` are done."""
     with progress_bar(progress) as show:
         report = functools.partial(show, what)

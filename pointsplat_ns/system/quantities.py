@@ -1,4 +1,5 @@
-"""Counts, sizes and durations as people write them: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB, 5 min 14 s."""
+"""Counts, sizes and durations as people write them: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB, 5 min 14
+s."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ from decimal import Decimal
 
 
 def parse_number(text: str) -> float:
-    """A number, with k, M or G for thousands, millions or billions. Raises ValueError if it is none.
+    """A number, with k, M or G for thousands, millions or billions. Raises ValueError if it is
+    none.
 
     Example:
         >>> parse_number("1e3"), parse_number("1.5M"), parse_number("1,000"), parse_number("0.3")
@@ -17,8 +19,13 @@ def parse_number(text: str) -> float:
     form = r"([+-]?(?:\d{1,3}(?:,\d{3})+|\d+)?(?:\.\d*)?(?:e[+-]?\d{1,3})?) ?([kmg]?)"
     found = re.fullmatch(form, text.strip(), re.IGNORECASE)
     if found is None or not re.match(r"[+-]?[\d.]*\d", found[1]):
-        raise ValueError(f"{text!r} is no number; expected one such as 0.5, 1000, 1,000, 1e3, 10k or 1.5M")
-    number = float(Decimal(found[1].replace(",", "")) * {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}[found[2].lower()])
+        raise ValueError(
+            f"{text!r} is no number; expected one such as 0.5, 1000, 1,000, 1e3, 10k or 1.5M"
+        )
+    number = float(
+        Decimal(found[1].replace(",", ""))
+        * {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}[found[2].lower()]
+    )
     if math.isinf(number):
         raise ValueError(f"{text!r} is too large")
     return number
@@ -33,12 +40,15 @@ def parse_count(text: str) -> int:
     """
     number = parse_number(text)
     if number != int(number):
-        raise ValueError(f"{text!r} is no whole number; expected one such as 1000, 1,000, 1e3 or 10k")
+        raise ValueError(
+            f"{text!r} is no whole number; expected one such as 1000, 1,000, 1e3 or 10k"
+        )
     return int(number)
 
 
 def parse_megabytes(text: str) -> float:
-    """A size, in units of 10^6 bytes; a number without a unit is in MB. Raises ValueError if it is none.
+    """A size, in units of 10^6 bytes; a number without a unit is in MB. Raises ValueError if it is
+    none.
 
     Example:
         >>> parse_megabytes("12kb"), parse_megabytes("1GB"), parse_megabytes("12"), parse_megabytes("5000B")

@@ -1,5 +1,6 @@
-"""torch's global settings change nothing here: each tensor is made with its type and its place named, functions that
-need gradients leave the caller's inference mode, and the rasterizer leaves autocast."""
+"""torch's global settings change nothing here: each tensor is made with its type and its place
+named, functions that need gradients leave the caller's inference mode, and the rasterizer leaves
+autocast."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ def numbers(count: int, device: torch.device) -> torch.Tensor:
 
 
 def add_rows(total: torch.Tensor, index: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """Add values (n, *) to the rows ``index`` (n,) of a total (N, *), and return it: in one order on each device, which
-    ``index_add_`` does not keep on a GPU."""
+    """Add values (n, *) to the rows ``index`` (n,) of a total (N, *), and return it: in one order
+    on each device, which ``index_add_`` does not keep on a GPU."""
     if total.device.type == "cpu":
         return total.index_add_(0, index, values)
     return total.index_put_((index,), values, accumulate=True)
@@ -35,31 +36,40 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def of_network() -> dict[str, Any]:
-    """Type and place of a network's parameters: float32, on the device that the network's constructor has entered,
-    which ``torch.get_default_device`` does not tell in torch 2.6."""
+    """Type and place of a network's parameters: float32, on the device that the network's
+    constructor has entered, which ``torch.get_default_device`` does not tell in torch 2.6."""
     return {"dtype": torch.float32, "device": None}
 
 
 def normal_mode(function: Function) -> Function:
-    """The function, run with :func:`~pointsplat_ns.system.threads.one_thread_each`, and outside of inference mode even
-    if it is called in it. Scenes and views among its arguments that were made in inference mode are copied, because
-    torch takes no gradients of such tensors."""
+    """The function, run with :func:`~pointsplat_ns.system.threads.one_thread_each`, and outside of
+    inference mode even if it is called in it. Scenes and views among its arguments that were made
+    in inference mode are copied, because torch takes no gradients of such tensors."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
         with torch.inference_mode(False), one_thread_each():
-            return function(*map(_copied, args), **{name: _copied(value) for name, value in kwargs.items()})
+            return function(
+                *map(_copied, args), **{name: _copied(value) for name, value in kwargs.items()}
+            )
 
     return cast(Function, run)
 
 
 def full_precision(function: Function) -> Function:
-    """The function, run without autocast on the device of its first tensor: in bfloat16, to which autocast rounds
-    matrix products, a position of 100 pixels is held to half a pixel."""
+    """The function, run without autocast on the device of its first tensor: in bfloat16, to which
+    autocast rounds matrix products, a position of 100 pixels is held to half a pixel."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
-        kind = next((value.device.type for value in (*args, *kwargs.values()) if isinstance(value, torch.Tensor)), "")
+        kind = next(
+            (
+                value.device.type
+                for value in (*args, *kwargs.values())
+                if isinstance(value, torch.Tensor)
+            ),
+            "",
+        )
         if kind not in ("cpu", "cuda"):
             return function(*args, **kwargs)
         with torch.autocast(kind, enabled=False):
@@ -69,10 +79,15 @@ def full_precision(function: Function) -> Function:
 
 
 def _copied(value: Any) -> Any:
-    """A tensor of inference mode, copied; a dataclass with such tensors, copied; anything else as it is."""
+    """A tensor of inference mode, copied; a dataclass with such tensors, copied; anything else as
+    it is."""
     if isinstance(value, torch.Tensor):
         return value.clone() if value.is_inference() else value
-    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else ()
+    fields = (
+        dataclasses.fields(value)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type)
+        else ()
+    )
     parts = {field.name: getattr(value, field.name) for field in fields if field.init}
     copies = {name: _copied(part) for name, part in parts.items()}
     changes = {name: copy for name, copy in copies.items() if copy is not parts[name]}

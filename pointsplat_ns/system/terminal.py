@@ -15,8 +15,9 @@ def print_table(
     left: Collection[int] = (0,),
     section: int = 0,
 ) -> None:
-    """Print a table. Columns whose number is in ``left`` are aligned left and may be folded; others are aligned right.
-    A line follows each ``section`` rows. Where there is no terminal, the table is as wide as it needs to be."""
+    """Print a table. Columns whose number is in ``left`` are aligned left and may be folded; others
+    are aligned right. A line follows each ``section`` rows. Where there is no terminal, the table
+    is as wide as it needs to be."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -31,5 +32,8 @@ def print_table(
         else:
             table.add_column(name, justify="right", no_wrap=True)
     for number, row in enumerate(rows, start=1):
-        table.add_row(*(escape(printable(cell)) for cell in row), end_section=section > 0 and number % section == 0)
+        table.add_row(
+            *(escape(printable(cell)) for cell in row),
+            end_section=section > 0 and number % section == 0,
+        )
     console.print(table)

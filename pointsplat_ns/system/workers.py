@@ -23,8 +23,9 @@ Result = TypeVar("Result")
 
 
 class Workers(Generic[Item, Result]):
-    """Processes that call a function with one item after the other, and share the cores. With one job, this process
-    does. When the context is left, or this process ends, the others end at once, whatever they do.
+    """Processes that call a function with one item after the other, and share the cores. With one
+    job, this process does. When the context is left, or this process ends, the others end at once,
+    whatever they do.
 
     Args:
         function: pickled once for each process.
@@ -32,14 +33,19 @@ class Workers(Generic[Item, Result]):
     """
 
     def __init__(self, function: Callable[[Item], Result], jobs: int):
-        self._function, self._jobs = function, jobs
+        self._function = function
+        self._jobs = jobs
 
     def __enter__(self) -> Workers[Item, Result]:
         if self._jobs > 1:
             context = get_context("spawn")
             ends, self._held = context.Pipe(duplex=False)
-            function = pickle.dumps(self._function)  # by multiprocessing, tensors would be moved to shared memory
-            with _started_safely(self._jobs):  # a pool starts multiprocessing's tracker of resources
+            function = pickle.dumps(
+                self._function
+            )  # by multiprocessing, tensors would be moved to shared memory
+            with _started_safely(
+                self._jobs
+            ):  # a pool starts multiprocessing's tracker of resources
                 self._pool = ProcessPoolExecutor(self._jobs, context, _begin, (ends, function))
         return self
 
@@ -49,8 +55,8 @@ class Workers(Generic[Item, Result]):
             self._pool.shutdown(cancel_futures=True)
 
     def results(self, items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
-        """Each item with its result, in the order in which they are made. Raises what the function raises, and
-        PointSplatError if a process is killed."""
+        """Each item with its result, in the order in which they are made. Raises what the function
+        raises, and PointSplatError if a process is killed."""
         if self._jobs == 1:
             for item in items:
                 yield item, self._function(item)
@@ -62,8 +68,8 @@ class Workers(Generic[Item, Result]):
                 yield futures[future], future.result()
         except BrokenProcessPool as error:
             raise PointSplatError(
-                "a process was killed, as happens where memory is short; the same command resumes, with fewer --jobs "
-                "if need be"
+                "a process was killed, as happens where memory is short; the same command resumes, "
+                "with fewer --jobs if need be"
             ) from error
 
 
@@ -100,18 +106,23 @@ _starting = threading.Lock()
 
 @contextmanager
 def _started_safely(jobs: int) -> Iterator[None]:
-    """Let processes that are started while the context is open have no Ctrl-C, not the current folder on their path,
-    and as many threads each as the environment variable ``OMP_NUM_THREADS`` says, else their share of the cores.
+    """Let processes that are started while the context is open have no Ctrl-C, not the current
+    folder on their path, and as many threads each as the environment variable ``OMP_NUM_THREADS``
+    says, else their share of the cores.
 
-    multiprocessing starts them and its resource tracker with ``python -c``, which puts the current folder first on the
-    path: what lies beside the scenes would be imported in place of Python's own modules. Python 3.10 has no option
-    against it. Ctrl-C would show a traceback of each process that is still importing.
+    multiprocessing starts them and its resource tracker with ``python -c``, which puts the current
+    folder first on the path: what lies beside the scenes would be imported in place of Python's own
+    modules. Python 3.10 has no option against it. Ctrl-C would show a traceback of each process
+    that is still importing.
     """
 
     def start_safely(path: bytes, args: Sequence[str], passfds: Sequence[int]) -> int:
         words = [*args]
         at = words.index("-c") + 1
-        words[at] = f"import sys; sys.path = [*filter(None, sys.path)]; {words[at]}"  # sys is part of the interpreter
+        words[at] = (
+            # sys is part of the interpreter
+            f"import sys; sys.path = [*filter(None, sys.path)]; {words[at]}"
+        )
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
             return start(path, words, passfds)

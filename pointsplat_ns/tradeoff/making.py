@@ -46,23 +46,39 @@ class Subject:
     """Folder of its photos, if they are not those of its run."""
 
     def names(self, setting: Setting) -> dict[str, Any]:
-        """The key, the label and the command of a setting's point. The command has the count, because percentages are
-        rounded."""
+        """The key, the label and the command of a setting's point. The command has the count,
+        because percentages are rounded."""
         if setting.by == DENSE:
             return {"key": DENSE, "label": DENSE, "command": ""}
         percent = 100 * setting.count / len(self.dense)
-        key, label, command = f"{percent:.4g}pct", f"{percent:.3g} %", "prune"
+        key = f"{percent:.4g}pct"
+        label = f"{percent:.3g} %"
+        command = "prune"
         options = ["--keep", str(setting.count), *self.words]
         if setting.by != "merge":
-            key, label = f"{key}_{setting.by}", f"{label} by {setting.by}"
+            key = f"{key}_{setting.by}"
+            label = f"{label} by {setting.by}"
             options += ["--by", setting.by]
         if setting.repair != "none":
-            trained = "trained on photos" if setting.repair == "photos" else f"repaired ({setting.repair})"
-            key, label, command = f"{key}_{setting.repair}", f"{label}, {trained}", "compact"
+            trained = (
+                "trained on photos"
+                if setting.repair == "photos"
+                else f"repaired ({setting.repair})"
+            )
+            key = f"{key}_{setting.repair}"
+            label = f"{label}, {trained}"
+            command = "compact"
             options += ["--effort", EFFORTS[setting.repair]]
         if setting.repair == "photos":
             options += ["--photos", *([] if self.photos is None else [str(self.photos)])]
-        words = ["pointsplat", command, str(self.path), *options, "-o", f"{name_of(self.path)}_{key}.ply"]
+        words = [
+            "pointsplat",
+            command,
+            str(self.path),
+            *options,
+            "-o",
+            f"{name_of(self.path)}_{key}.ply",
+        ]
         return {"key": key, "label": label, "command": shlex.join(words)}
 
 
@@ -76,9 +92,12 @@ def subject_at(
     progress: Progress,
     training: bool,
 ) -> Subject:
-    """The scene at a path, with the options on views that its commands repeat; ``photos`` is a folder of photos. With
-    ``training``, photos are also trained on. Raises a PointSplatError if there are none."""
-    size, upward, sampled = parse_resolution(resolution), up_named(up), without_poses(poses)
+    """The scene at a path, with the options on views that its commands repeat; ``photos`` is a
+    folder of photos. With ``training``, photos are also trained on. Raises a PointSplatError if
+    there are none."""
+    size = parse_resolution(resolution)
+    upward = up_named(up)
+    sampled = without_poses(poses)
     held_out: Callable[[], Photos] | None = None
     trained: Photos | None = None
     run = None if sampled or photos is not None else path
@@ -91,28 +110,40 @@ def subject_at(
             check_photos(dense, trained, str(path))
     else:
         dense, posed = read_with_photos(path, photos, poses, data, size, progress, training)
-        given, file, trained = posed.views, posed.poses, posed.training
+        given = posed.views
+        file = posed.poses
+        trained = posed.training
         held_out = lambda: posed.held_out  # noqa: E731
     named = {
         "--poses": NO_POSES if sampled else file,
         "--resolution": None if size is None else size_text(size),
         "--data": data,
     }
-    words = [word for option, value in named.items() if value is not None for word in (option, str(value))]
+    words = [
+        word
+        for option, value in named.items()
+        if value is not None
+        for word in (option, str(value))
+    ]
     words += [] if up is None else [f"--up={up}"]
     new_views = functools.partial(view_source, dense, given, run, data, size, upward)
     return Subject(dense, path, new_views, held_out, trained, tuple(words), size, photos)
 
 
 def make(subject: Subject, setting: Setting, progress: Progress) -> tuple[Gaussians, float]:
-    """The scene of a setting, and the seconds that it took: from a new source of views, so that time and result equal
-    the command's. Raises KeyboardInterrupt on Ctrl-C, also during a repair."""
-    dense, views, start = subject.dense, subject.new_views(), time.perf_counter()
+    """The scene of a setting, and the seconds that it took: from a new source of views, so that
+    time and result equal the command's. Raises KeyboardInterrupt on Ctrl-C, also during a
+    repair."""
+    dense = subject.dense
+    views = subject.new_views()
+    start = time.perf_counter()
     if setting.repair == "none":
         scene = prune_scene(dense, PruneRequest(setting.count, setting.by), views, progress).scene
     else:
         budget = RepairBudget(EFFORTS[setting.repair])
-        request = CompactRequest.of(None, setting.count, setting.by, repair=budget, photos=setting.repair == "photos")
+        request = CompactRequest.of(
+            None, setting.count, setting.by, repair=budget, photos=setting.repair == "photos"
+        )
         compacted = compact_scene(dense, request, views, progress, subject.training)
         if compacted.interrupted:
             raise KeyboardInterrupt

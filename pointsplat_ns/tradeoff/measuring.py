@@ -1,7 +1,8 @@
-"""Measures one point: compares a smaller scene with the dense scene and with photos, and times its frames.
+"""Measures one point: compares a smaller scene with the dense scene and with photos, and times its
+frames.
 
-On a shared machine the time of a frame may double within a minute. So each frame is timed beside a frame of the dense
-scene in the same view: both slow down alike, and the ratio of their times stays.
+On a shared machine the time of a frame may double within a minute. So each frame is timed beside a
+frame of the dense scene in the same view: both slow down alike, and the ratio of their times stays.
 """
 
 from __future__ import annotations
@@ -35,12 +36,13 @@ from pointsplat_ns.view_source import VIEW_COUNTS
 from pointsplat_ns.views import View, Views, spread_indices
 
 ROUNDS = 3
-"""Number of timed frames of each view, alternating between the dense scene and the measured scene."""
+"""Number of timed frames of each view, alternating between the dense scene and the measured
+scene."""
 
 
 class JudgedViews(NamedTuple):
-    """The views that scenes are drawn and timed in, their photos of the same size in [0, 1], if there are some, and a
-    text on their origin."""
+    """The views that scenes are drawn and timed in, their photos of the same size in [0, 1], if
+    there are some, and a text on their origin."""
 
     views: Views
     photos: list[Example] | None
@@ -48,9 +50,9 @@ class JudgedViews(NamedTuple):
 
 
 def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
-    """At most ``count`` views of a middle size, and a note. They are the views of held-out photos, which are averaged
-    over the areas of pixels, or else those of the :class:`~pointsplat_ns.compression.quality.Judge`. Raises DataError
-    if there are none."""
+    """At most ``count`` views of a middle size, and a note. They are the views of held-out photos,
+    which are averaged over the areas of pixels, or else those of the
+    :class:`~pointsplat_ns.compression.quality.Judge`. Raises DataError if there are none."""
     note = ""
     if subject.held_out is not None:
         try:
@@ -60,11 +62,15 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
             small = views.resized(max(middle.width, middle.height))
             if small is not views:
                 photos = [_averaged(photo, view) for photo, view in zip(photos, small, strict=True)]
-            return JudgedViews(small, photos, f"held-out photos of {subject.photos or 'the dataset'}"), note
+            return JudgedViews(
+                small, photos, f"held-out photos of {subject.photos or 'the dataset'}"
+            ), note
         except (SceneError, DataError) as error:
             note = f"there are no held-out photos: {error}"
     source = subject.new_views()
-    return JudgedViews(source.compared().spread(min(count, VIEW_COUNTS.compared)), None, source.origin), note
+    return JudgedViews(
+        source.compared().spread(min(count, VIEW_COUNTS.compared)), None, source.origin
+    ), note
 
 
 def photos_of_one_size(photos: Photos, count: int) -> tuple[Views, list[Example], str]:
@@ -76,42 +82,64 @@ def photos_of_one_size(photos: Photos, count: int) -> tuple[Views, list[Example]
     size = max(sizes, key=sizes.count)
     of_size = [example for example in shown if example.target.shape == size]
     first = of_size[0].view
-    viewmats, Ks = (torch.stack(mats) for mats in zip(*((s.view.viewmat, s.view.K) for s in of_size), strict=True))
+    viewmats, Ks = (
+        torch.stack(mats)
+        for mats in zip(*((s.view.viewmat, s.view.K) for s in of_size), strict=True)
+    )
     views = Views(viewmats, Ks, first.width, first.height, first.background, first.rasterize_mode)
     others = len(shown) - len(of_size)
-    note = f"{others} of {len(shown)} held-out photos are of another size and left out" if others else ""
-    return views, [example._replace(target=in_unit_range(example.target).float()) for example in of_size], note
+    note = (
+        f"{others} of {len(shown)} held-out photos are of another size and left out"
+        if others
+        else ""
+    )
+    return (
+        views,
+        [example._replace(target=in_unit_range(example.target).float()) for example in of_size],
+        note,
+    )
 
 
 def _averaged(photo: Example, view: View) -> Example:
-    """A photo reduced to a view, by the mean of each area; a pixel counts if half of its area does."""
+    """A photo reduced to a view, by the mean of each area; a pixel counts if half of its area
+    does."""
 
     def reduced(image: Tensor) -> Tensor:
         planes = image.permute(2, 0, 1)[None].float()
-        return torch.nn.functional.interpolate(planes, (view.height, view.width), mode="area")[0].permute(1, 2, 0)
+        return torch.nn.functional.interpolate(planes, (view.height, view.width), mode="area")[
+            0
+        ].permute(1, 2, 0)
 
-    return Example(view, reduced(photo.target), None if photo.mask is None else reduced(photo.mask) >= 0.5)
+    return Example(
+        view, reduced(photo.target), None if photo.mask is None else reduced(photo.mask) >= 0.5
+    )
 
 
 class Measurer:
-    """Judges scenes as every command does, and measures them in the same views: frame times, and errors against photos
-    if there are some. ``views`` is the largest number of views that are timed, and of photos. Raises SceneError if no
-    Gaussian can be drawn; DataError if there are no views, or they are too small for SSIM."""
+    """Judges scenes as every command does, and measures them in the same views: frame times, and
+    errors against photos if there are some. ``views`` is the largest number of views that are
+    timed, and of photos. Raises SceneError if no Gaussian can be drawn; DataError if there are no
+    views, or they are too small for SSIM."""
 
     def __init__(self, subject: Subject, views: int):
         need_usable(subject.dense)
-        self.subject, self.dense = subject, subject.dense
+        self.subject = subject
+        self.dense = subject.dense
         self._dense_ms: float | None = None
-        """Time of a frame of the dense scene, which is measured first: the unit of measured ratios."""
+        """Time of a frame of the dense scene, which is measured first: the unit of measured
+        ratios."""
         self.judge = Judge(self.dense, subject.new_views())
         self.judged, self.note = views_to_judge(subject, views)
         shown = self.judged.views
         if min(shown.width, shown.height) < SSIM_WINDOW:
-            raise DataError(f"views are {shown.width} x {shown.height} pixels; expected at least {SSIM_WINDOW} a side")
+            raise DataError(
+                f"views are {shown.width} x {shown.height} pixels; expected at least "
+                f"{SSIM_WINDOW} a side"
+            )
 
     def point(self, setting: Setting, scene: Gaussians, seconds: float, show: Progress) -> Point:
-        """The point of a setting, from its scene and the seconds of making it; the dense scene comes first. ``show`` is
-        called with the name of the current task and its share done."""
+        """The point of a setting, from its scene and the seconds of making it; the dense scene
+        comes first. ``show`` is called with the name of the current task and its share done."""
         show("comparing", 0.0)
         quality = self.judge.quality(scene)
         assert quality.ssim is not None
@@ -140,7 +168,8 @@ class Measurer:
     def _against_photos(self, scene: Gaussians) -> ImageMetrics | None:
         if self.judged.photos is None:
             return None
-        photos, views = self.judged.photos, self.judged.views
+        photos = self.judged.photos
+        views = self.judged.views
         pairs = [(photo, render(scene, view)) for photo, view in zip(photos, views, strict=True)]
         similar = fmean(float(ssim(*photo.compared(image))) for photo, image in pairs)
         return ImageMetrics(fmean(photo.psnr(image) for photo, image in pairs), similar)
@@ -148,7 +177,9 @@ class Measurer:
     @torch.no_grad()
     def _speed(self, scene: Gaussians, show: Progress) -> tuple[Speed, float | None]:
         """The measured ratio of frames, and the cores that other programs used meanwhile."""
-        others, pairs, views = OtherPrograms(), [], self.judged.views
+        others = OtherPrograms()
+        pairs = []
+        views = self.judged.views
         for _ in range(ROUNDS):
             for view in views:
                 pairs.append((_timed(self.dense, view), _timed(scene, view)))
@@ -170,21 +201,31 @@ def _timed(scene: Gaussians, view: View) -> float:
 
 def machine_text(device: torch.device) -> str:
     """Processor, number of threads, device and version of torch, as text."""
-    threads, about = most_threads(), Path("/proc/cpuinfo")  # of Linux
-    models = re.findall(r"^model name\s*: *(.*)", about.read_text("utf-8", "replace"), re.M) if about.exists() else []
+    # of Linux
+    threads = most_threads()
+    about = Path("/proc/cpuinfo")
+    models = (
+        re.findall(r"^model name\s*: *(.*)", about.read_text("utf-8", "replace"), re.M)
+        if about.exists()
+        else []
+    )
     processor = next(iter(models), "") or platform.processor() or platform.machine()
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
-    return f"{processor}, {threads} thread{'s' if threads != 1 else ''}, {where}, torch {torch.__version__}"
+    return (
+        f"{processor}, {threads} thread{'s' if threads != 1 else ''}, {where}, torch "
+        f"{torch.__version__}"
+    )
 
 
 def busy_note(others: Sequence[float | None]) -> str:
-    """A line of text if other programs disturbed measurements, from the cores that they used during each, which are
-    None where nothing was timed; else empty. A quarter of a core does not change medians."""
+    """A line of text if other programs disturbed measurements, from the cores that they used during
+    each, which are None where nothing was timed; else empty. A quarter of a core does not change
+    medians."""
     timed = [used for used in others if used is not None]
     disturbed = [used for used in timed if used + most_threads() > cores() + 0.25]
     if not disturbed:
         return ""
     return (
-        f"the machine was busy: while {len(disturbed)} of {len(timed)} points were timed, other programs took up "
-        f"to {max(disturbed):.1f} of {cores()} cores; times are not to be trusted"
+        f"the machine was busy: while {len(disturbed)} of {len(timed)} points were timed, other "
+        f"programs took up to {max(disturbed):.1f} of {cores()} cores; times are not to be trusted"
     )

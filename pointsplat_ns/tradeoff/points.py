@@ -11,7 +11,8 @@ from pointsplat_ns.compression.repair import Effort
 from pointsplat_ns.io.files import write_json
 
 Repair = Literal["none", "quick", "thorough", "photos"]
-"""Kinds of repair: none, those of ``compact`` by effort, and ``quick`` with a training on the photos after it."""
+"""Kinds of repair: none, those of ``compact`` by effort, and ``quick`` with a training on the
+photos after it."""
 
 REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
@@ -43,7 +44,8 @@ class ImageMetrics:
 
 
 class Speed(NamedTuple):
-    """Ratio of the dense scene's time of a frame to that of a point: median over views, and quartiles."""
+    """Ratio of the dense scene's time of a frame to that of a point: median over views, and
+    quartiles."""
 
     median: float
     low: float
@@ -55,7 +57,8 @@ class Point:
     """The measurement of one way of making a scene smaller."""
 
     key: str
-    """Short name, unique in a table and fit for a file's name: ``dense``, ``10pct``, ``10pct_quick``."""
+    """Short name, unique in a table and fit for a file's name: ``dense``, ``10pct``,
+    ``10pct_quick``."""
     label: str
     """The same for people: ``10 %, repaired (quick)``."""
     command: str
@@ -76,8 +79,8 @@ class Point:
     """Quality against held-out photos; None where there are none."""
     speed: Speed
     frame_ms: float
-    """Milliseconds of a frame: the dense scene's at the start, divided by the median speed, so that points are
-    comparable when the machine gets slower."""
+    """Milliseconds of a frame: the dense scene's at the start, divided by the median speed, so that
+    points are comparable when the machine gets slower."""
     fill: float
     """Mean number of Gaussians that viewers draw on a pixel."""
     seconds: float
@@ -127,5 +130,7 @@ class Tradeoff:
 
 def write_points(found: Tradeoff, folder: Path) -> None:
     """Write all points as JSON."""
-    points = [{**dataclasses.asdict(point), "speed": point.speed._asdict()} for point in found.points]
+    points = [
+        {**dataclasses.asdict(point), "speed": point.speed._asdict()} for point in found.points
+    ]
     write_json({**dataclasses.asdict(found), "points": points}, folder / RESULTS["json"])

@@ -1,8 +1,8 @@
 """The loss of each point in dB, and the fastest point within a loss.
 
-With photos, the loss is measured: the PSNR of the dense scene minus the PSNR of the smaller scene. Without photos it is
-estimated: a trained scene typically has :data:`PHOTO_PSNR` against its photos, the change of a smaller scene is
-independent of that error, and such squared errors add up.
+With photos, the loss is measured: the PSNR of the dense scene minus the PSNR of the smaller scene.
+Without photos it is estimated: a trained scene typically has :data:`PHOTO_PSNR` against its photos,
+the change of a smaller scene is independent of that error, and such squared errors add up.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.tradeoff.points import Point
 
 PHOTO_PSNR = 27.0
-"""Assumed PSNR in dB of a trained scene against held-out photos: about that of 3DGS on the captures of papers."""
+"""Assumed PSNR in dB of a trained scene against held-out photos: about that of 3DGS on the captures
+of papers."""
 
 
 def expected_loss(psnr: float) -> float:
-    """The loss against photos, dB, of a scene whose renders have a PSNR (dB) against the dense scene's."""
+    """The loss against photos, dB, of a scene whose renders have a PSNR (dB) against the dense
+    scene's."""
     return 10 * math.log10(1 + 10 ** ((PHOTO_PSNR - psnr) / 10))
 
 
@@ -35,24 +37,30 @@ def loss_of(point: Point, dense: Point) -> float:
 
 
 def next_best(points: Sequence[Point]) -> Point | None:
-    """The point with the least loss after the dense scene, which is the first; None if there is no other."""
-    return min(points[1:], key=lambda point: (loss_of(point, points[0]), point.gaussians), default=None)
+    """The point with the least loss after the dense scene, which is the first; None if there is no
+    other."""
+    return min(
+        points[1:], key=lambda point: (loss_of(point, points[0]), point.gaussians), default=None
+    )
 
 
 def fastest_within(points: Sequence[Point], loss: float, trusted: bool = True) -> Point:
-    """The fastest point that loses at most ``loss`` dB; of those as fast the one with the fewest Gaussians, then the
-    smallest file. The first point is the dense scene, which loses nothing. Times that are not ``trusted`` are
-    ignored."""
+    """The fastest point that loses at most ``loss`` dB; of those as fast the one with the fewest
+    Gaussians, then the smallest file. The first point is the dense scene, which loses nothing.
+    Times that are not ``trusted`` are ignored."""
     # 1e-9, because differences of decimal numbers are not exact: 30.1 - 29.6 is more than 0.5.
     enough = [point for point in points if loss_of(point, points[0]) <= loss + 1e-9]
-    return min(enough, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
+    return min(
+        enough, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes)
+    )
 
 
 def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
-    """As :func:`fastest_within`, with a text on the point. If it is the dense scene, the text has the figures of the
-    best of the others too."""
+    """As :func:`fastest_within`, with a text on the point. If it is the dense scene, the text has
+    the figures of the best of the others too."""
     dense = points[0]
-    best, other = fastest_within(points, within, trusted), next_best(points)
+    best = fastest_within(points, within, trusted)
+    other = next_best(points)
     if dense.against_photos is not None:
         limit = f"loses at most {within:g} dB against held-out photos"
         value = "" if other is None else f"loses {loss_of(other, dense):.2f} dB"
@@ -65,13 +73,19 @@ def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> t
         return best, f"the {what} that {limit}: {best.label}, {_figures(best, dense, trusted)}"
     why = f"no {'faster' if trusted else 'smaller'} point {limit}"
     if other is not None:
-        why += f"; the best, {other.label}, {value}: {_figures(other, dense, trusted)}, made in {other.seconds:.0f} s"
+        why += (
+            f"; the best, {other.label}, {value}: {_figures(other, dense, trusted)}, made in "
+            f"{other.seconds:.0f} s"
+        )
     return dense, why
 
 
 def _figures(point: Point, dense: Point, trusted: bool) -> str:
     """Count, size, and where times are trusted the time of a frame."""
-    figures = f"{point.gaussians:,} Gaussians, {bytes_text(point.bytes)} in place of {bytes_text(dense.bytes)}"
+    figures = (
+        f"{point.gaussians:,} Gaussians, {bytes_text(point.bytes)} in place of "
+        f"{bytes_text(dense.bytes)}"
+    )
     if not trusted:
         return figures
     speed = f"{point.speed.median:.2g} times as fast"

@@ -57,24 +57,25 @@ def measure_tradeoff(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Tradeoff:
-    """Measure how a scene trades quality for frame time, size and count, on this machine: each method and repair at
-    each budget.
+    """Measure how a scene trades quality for frame time, size and count, on this machine: each
+    method and repair at each budget.
 
     Args:
-        scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are then used where they are found.
+        scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are then used where
+            they are found.
         folder: where the figures (JSON) and the page go.
         keep: budgets, as for :func:`pointsplat_ns.prune`, but for a PSNR.
-        within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
-            expected of its renders (:mod:`~pointsplat_ns.tradeoff.recommend`).
+        within: the recommended point is the fastest that loses at most so much, dB: against photos,
+            or as much as is expected of its renders (:mod:`~pointsplat_ns.tradeoff.recommend`).
         by: methods, as for :func:`pointsplat_ns.prune`.
-        repairs: some of "none", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`, and "photos", its
-            training on the photos.
+        repairs: some of "none", "quick" and "thorough", the efforts of
+            :func:`pointsplat_ns.compact`, and "photos", its training on the photos.
         views: largest number of views that are timed, and of photos; without photos at most 12.
-        poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no photos are used then,
-            unless they are named.
-        resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged in pictures of this size, as by every
-            command. Frames are timed, and pictures drawn, at a middle size, of 784 x 441 pixels for 1920 x 1080; photos
-            are reduced to it.
+        poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no
+            photos are used then, unless they are named.
+        resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged in pictures of this size,
+            as by every command. Frames are timed, and pictures drawn, at a middle size, of 784 x
+            441 pixels for 1920 x 1080; photos are reduced to it.
         up: as for :func:`pointsplat_ns.prune`.
         data, photos: as for :func:`pointsplat_ns.prune`; the photos of a run are used anyway.
         force: overwrite results in the folder.
@@ -101,12 +102,15 @@ def measure_tradeoff(
         ['dense', '10pct']
     """
     check_options(keep, by, repairs, within, views)
-    path, folder = Path(scene), Path(folder)
+    path = Path(scene)
+    folder = Path(folder)
     need_named_data(path, data)
     need_folder(folder)
     with progress_bar(progress) as report:
         if (folder / RESULTS["json"]).exists() and not force:
-            raise SceneError(f"{folder / RESULTS['json']}: exists already; name another folder, or use --force")
+            raise SceneError(
+                f"{folder / RESULTS['json']}: exists already; name another folder, or use --force"
+            )
         report("looking for views", 0.0)
         own = None if photos is None else Path(photos)
         subject = subject_at(path, poses, resolution, up, data, own, report, "photos" in repairs)
@@ -115,7 +119,9 @@ def measure_tradeoff(
         try:
             for number, setting in enumerate(table, start=1):
 
-                def show(what: str, share: float, name: str = f"point {number} of {len(table)}") -> None:
+                def show(
+                    what: str, share: float, name: str = f"point {number} of {len(table)}"
+                ) -> None:
                     report(f"{name}: {what}", share)
 
                 made = (subject.dense, 0.0) if setting.by == DENSE else make(subject, setting, show)
@@ -136,14 +142,18 @@ def check_options(
     if views < 1:
         raise PointSplatError(f"{views} views; expected at least one")
     if not keep or not by:
-        raise PointSplatError("no budget or no method is named; expected at least one of each, such as 10%, merge")
+        raise PointSplatError(
+            "no budget or no method is named; expected at least one of each, such as 10%, merge"
+        )
     for budget in keep:
         if isinstance(budget, str):
             parse_keep(budget)
     for method in by:
         method_named(method)
     if not repairs or not {*repairs} <= {*REPAIRS}:
-        raise PointSplatError(f"repairs: {', '.join(repairs) or 'empty'}; expected some of {', '.join(REPAIRS)}")
+        raise PointSplatError(
+            f"repairs: {', '.join(repairs) or 'empty'}; expected some of {', '.join(REPAIRS)}"
+        )
 
 
 def settings_of(
@@ -160,12 +170,15 @@ class _Measuring:
     """The points so far, and their pictures."""
 
     def __init__(self, measurer: Measurer, within: float, folder: Path):
-        self.measurer, self.within, self.folder = measurer, within, folder
+        self.measurer = measurer
+        self.within = within
+        self.folder = folder
         self.points: list[Point] = []
         self.shown = spread_indices(len(measurer.judged.views), 6)  # views with pictures
         photos = measurer.judged.photos
         self.pictures: list[dict[str, str]] = [
-            {} if photos is None else {"photo": picture_uri(to_uint8(photos[index].target))} for index in self.shown
+            {} if photos is None else {"photo": picture_uri(to_uint8(photos[index].target))}
+            for index in self.shown
         ]
         """For each view, pictures for the page: the photo, and that of each point by its key."""
 
@@ -174,12 +187,15 @@ class _Measuring:
         """Measure a scene, and draw it."""
         point = self.measurer.point(setting, scene, seconds, show)
         for pictures, index in zip(self.pictures, self.shown, strict=True):
-            pictures[point.key] = picture_uri(to_uint8(render(scene, self.measurer.judged.views[index])))
+            pictures[point.key] = picture_uri(
+                to_uint8(render(scene, self.measurer.judged.views[index]))
+            )
         self.points.append(point)
 
     def write(self, note: str = "") -> Tradeoff:
         """Write and return the results so far."""
-        measurer, busy = self.measurer, busy_note([point.others_cores for point in self.points])
+        measurer = self.measurer
+        busy = busy_note([point.others_cores for point in self.points])
         best, why = recommend(self.points, self.within, trusted=not busy)
         found = Tradeoff(
             scene=name_of(measurer.subject.path),
@@ -199,15 +215,28 @@ class _Measuring:
 
 
 def write_page(found: Tradeoff, pictures: Sequence[dict[str, str]], output: Path) -> None:
-    """Write one HTML file with the points of a scene, which needs no other file. ``pictures`` are, for each view, data
-    URIs of the picture of each point by its key, and of the photo as ``photo``."""
-    dense, best = found.points[0], found.point(found.recommended)
+    """Write one HTML file with the points of a scene, which needs no other file. ``pictures`` are,
+    for each view, data URIs of the picture of each point by its key, and of the photo as
+    ``photo``."""
+    dense = found.points[0]
+    best = found.point(found.recommended)
     shown = next_best(found.points) or best if best is dense else best
-    data = {"points": [_data(point) for point in found.points], "pictures": list(pictures), "shown": shown.key}
+    data = {
+        "points": [_data(point) for point in found.points],
+        "pictures": list(pictures),
+        "shown": shown.key,
+    }
     html = page(
-        "tradeoff.html", ("tradeoff.js",), found=found, photos=dense.against_photos is not None,
-        shown=shown, word_for=word_for, three_digits=three_digits, infinity=math.inf, data=data,
-    )  # fmt: skip
+        "tradeoff.html",
+        ("tradeoff.js",),
+        found=found,
+        photos=dense.against_photos is not None,
+        shown=shown,
+        word_for=word_for,
+        three_digits=three_digits,
+        infinity=math.inf,
+        data=data,
+    )
     with replacing(output) as part:
         part.write_bytes(html)
 
@@ -219,9 +248,21 @@ def _data(point: Point) -> dict[str, Any]:
         psnr = None if quality is None or quality.psnr == math.inf else quality.psnr
         return {"psnr": psnr, "ssim": None if psnr is None or quality is None else quality.ssim}
 
-    figures = [] if point.against_photos is None else [f"{point.against_photos.psnr:.1f} dB against photos"]
-    figures += [] if point.by == "dense" else [f"{decibels(point.against_dense.psnr)} against the dense scene"]
-    figures += [f"{point.speed.median:.2g} times as fast", f"{point.gaussians:,} Gaussians", bytes_text(point.bytes)]
+    figures = (
+        []
+        if point.against_photos is None
+        else [f"{point.against_photos.psnr:.1f} dB against photos"]
+    )
+    figures += (
+        []
+        if point.by == "dense"
+        else [f"{decibels(point.against_dense.psnr)} against the dense scene"]
+    )
+    figures += [
+        f"{point.speed.median:.2g} times as fast",
+        f"{point.gaussians:,} Gaussians",
+        bytes_text(point.bytes),
+    ]
     repaired = "" if point.repair == "none" else f", repaired ({point.repair})"
     return {
         "key": point.key,

@@ -24,17 +24,28 @@ def test_clean_writes_what_the_function_returns_and_a_picture(room, capsys):
     said = capsys.readouterr().out
     written = ps.load(room.with_name("room_clean.ply"))
     assert same_bits(written, ps.clean(room, 1.0, resolution="64x48"))
-    removed, all_of_them = 1257 - len(written), "1,257"
-    assert 5 <= removed < 1257 and f"room_clean.ply: cleaned to {len(written):,} of {all_of_them} Gaussians" in said
+    removed = 1257 - len(written)
+    all_of_them = "1,257"
+    assert (
+        5 <= removed < 1257
+        and f"room_clean.ply: cleaned to {len(written):,} of {all_of_them} Gaussians" in said
+    )
     assert "float before what 40 views show" in said and "cluster" in said and " dB, SSIM " in said
-    assert picture.read_bytes()[:4] == b"\x89PNG" and f"{picture}: the scene, what goes, and the result" in said
+    assert (
+        picture.read_bytes()[:4] == b"\x89PNG"
+        and f"{picture}: the scene, what goes, and the result" in said
+    )
 
 
 def test_clean_in_json_and_of_a_clean_scene(room, capsys):
     output = room.with_name("same.spz")
     run("clean", room, "-o", output, "--strength", 0, "--resolution", "64x48", "--json")
     result = json.loads(capsys.readouterr().out)
-    assert result["gaussians_before"] == 1257 and result["output"] == str(output) and result["picture"] is None
+    assert (
+        result["gaussians_before"] == 1257
+        and result["output"] == str(output)
+        and result["picture"] is None
+    )
 
 
 @pytest.mark.parametrize(

@@ -43,17 +43,34 @@ def helps(tmp_path_factory) -> Path:
     refiner = Refiner(preset("tiny"))
     with torch.no_grad():
         [*refiner.heads.mlps["scales"].modules()][-1].bias.fill_(0.05)
-    save_refiner(refiner, path := tmp_path_factory.mktemp("helps") / "r.safetensors", {"keep": 0.5, "by": "opacity"})
+    save_refiner(
+        refiner,
+        path := tmp_path_factory.mktemp("helps") / "r.safetensors",
+        {"keep": 0.5, "by": "opacity"},
+    )
     return path
 
 
 def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys):
     output = tmp_path / "new" / "small.ply"
-    run("compact", ply, "--refiner", helps, "-o", output, "--picture", tmp_path / "shown.png", "--verbose")
+    run(
+        "compact",
+        ply,
+        "--refiner",
+        helps,
+        "-o",
+        output,
+        "--picture",
+        tmp_path / "shown.png",
+        "--verbose",
+    )
     kept = prune(read_ply(ply), 0.5, "opacity")
     assert same(read_ply(output), kept.replace(scales=kept.scales + 0.05))
     said = capsys.readouterr().out
-    assert re.search(r"small.ply: pruned by opacity and refined to 75 of 150 Gaussians \(50 %\), .* kB, in .* s", said)
+    assert re.search(
+        r"small.ply: pruned by opacity and refined to 75 of 150 Gaussians \(50 %\), .* kB, in .* s",
+        said,
+    )
     lines = said.splitlines()
     figures = r"([\d.]+) -> ([\d.]+) dB PSNR .* \(12 views of .*; worst .* dB, better in \d+"
     found = re.match(f"refined by the network: {figures}", lines[1])
@@ -66,11 +83,24 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
 
 
 def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, capsys, monkeypatch):
-    """It names the files and their sizes, in their formats, and opens as ``pointsplat view`` does."""
-    output, shown = tmp_path / "small.sog", tmp_path / "shown.html"
+    """It names the files and their sizes, in their formats, and opens as ``pointsplat view``
+    does."""
+    output = tmp_path / "small.sog"
+    shown = tmp_path / "shown.html"
     titles: list[str] = []
     monkeypatch.setattr(pictures, "side_by_side", lambda rows, given, path: titles.extend(given))
-    run("compact", ply, "--refiner", helps, "-o", output, "--html", shown, "--picture", tmp_path / "shown.png")
+    run(
+        "compact",
+        ply,
+        "--refiner",
+        helps,
+        "-o",
+        output,
+        "--html",
+        shown,
+        "--picture",
+        tmp_path / "shown.png",
+    )
     said = capsys.readouterr().out
     assert f"{shown}: {bytes_text(shown.stat().st_size)}, to fly through in a browser" in said
     text = shown.read_text("utf-8")
@@ -84,19 +114,27 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
     ]
     assert titles[0].splitlines()[2:] == files[:1]
     assert titles[-1].splitlines()[2:] == [files[1], *quality.split(": ")]
-    assert flight["views"] == FlightFrame.of(read_scene(ply)).data([])["views"] and len(flight["views"]) == 6
+    assert (
+        flight["views"] == FlightFrame.of(read_scene(ply)).data([])["views"]
+        and len(flight["views"]) == 6
+    )
 
 
 @pytest.mark.parametrize("goal", [name for name in GOALS if name])
 def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, capsys):
-    """The budget is an upper bound, so this scene is whole; its page has it alone. Options replace the goal's parts."""
+    """The budget is an upper bound, so this scene is whole; its page has it alone. Options replace
+    the goal's parts."""
     monkeypatch.chdir(tmp_path)
     write_ply(room(), "my room.ply")
-    wanted, file, page = GOALS[goal], Path(f"my room_{goal}{GOALS[goal].suffix}"), Path(f"my room_{goal}.html")
+    wanted = GOALS[goal]
+    file = Path(f"my room_{goal}{GOALS[goal].suffix}")
+    page = Path(f"my room_{goal}.html")
     run("compact", "my room.ply", "--for", goal)
     said = capsys.readouterr().out
     assert "all 150 Gaussians fit as they are" in said and len(read_scene(file)) == 150
-    assert page.exists() == wanted.page and ("smaller --keep lowers it" in said) == (goal == "headset")
+    assert page.exists() == wanted.page and ("smaller --keep lowers it" in said) == (
+        goal == "headset"
+    )
     if wanted.page:
         [shown] = parts_of(page).data["flight"]["scenes"]
         assert (shown["name"], shown["amount"]) == ("my-room", "150 Gaussians")
@@ -105,9 +143,15 @@ def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, cap
     assert [*find_scenes(tmp_path)] == ["my room"]
     words = ("compact", "my room.ply", "--for", goal)
     run(*words, "--keep", "50%", "--html", "both.html", "--effort", "instant", "--force")
-    assert len(read_scene(file)) == 75 and len(parts_of(Path("both.html")).data["flight"]["scenes"]) == 2
+    assert (
+        len(read_scene(file)) == 75
+        and len(parts_of(Path("both.html")).data["flight"]["scenes"]) == 2
+    )
     refused = refusal(capsys, tmp_path, *words, "-o", "small.ply")
-    assert f"small.ply: --for {goal} writes {wanted.suffix}; expected such a name, or --keep in place" in refused
+    assert (
+        f"small.ply: --for {goal} writes {wanted.suffix}; expected such a name, or --keep in place"
+        in refused
+    )
 
 
 @pytest.mark.parametrize(
@@ -123,7 +167,9 @@ def test_without_options_two_commands_come_next(psnr, other, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     save(room(), "a room.spz")
     measured = quality.quality_of_file
-    monkeypatch.setattr(quality, "quality_of_file", lambda *given: replace(measured(*given), psnr=psnr))
+    monkeypatch.setattr(
+        quality, "quality_of_file", lambda *given: replace(measured(*given), psnr=psnr)
+    )
     run("compact", "a room.spz")
     *_, first, second = capsys.readouterr().out.splitlines()
     assert first == "next: pointsplat view 'a room.spz' 'a room_compact.spz'"
@@ -132,8 +178,12 @@ def test_without_options_two_commands_come_next(psnr, other, tmp_path, monkeypat
     assert "next: " not in capsys.readouterr().out
 
 
-def test_what_cannot_be_used_is_refused_in_one_line_and_early(ply, helps, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pointsplat_ns.compression.compact.prune_scene", None)  # a call of it would be no error of ours
+def test_what_cannot_be_used_is_refused_in_one_line_and_early(
+    ply, helps, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(
+        "pointsplat_ns.compression.compact.prune_scene", None
+    )  # a call of it would be no error of ours
     save_refiner(Refiner(preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
     shown = tmp_path / "shown"
     for scene, options, wanted in (

@@ -32,8 +32,11 @@ def test_convert_writes_what_the_name_says_and_prints_its_size(scene, tmp_path, 
 def test_convert_cuts_turns_and_scales(scene, tmp_path, capsys):
     run("convert", scene, tmp_path / "b.ply", "--sh", "1", "--up=-y:z", "--scale", "2")
     assert "SH degree 2 cut to 1" in capsys.readouterr().out
-    before, after = ps.load(scene), ps.load(tmp_path / "b.ply")
-    assert after.sh_degree == 1 and torch.allclose(after.means[:, 2], -2 * before.means[:, 1], atol=1e-5)
+    before = ps.load(scene)
+    after = ps.load(tmp_path / "b.ply")
+    assert after.sh_degree == 1 and torch.allclose(
+        after.means[:, 2], -2 * before.means[:, 1], atol=1e-5
+    )
 
 
 def test_info_prints_a_page_or_json(scene, capsys):
@@ -42,7 +45,10 @@ def test_info_prints_a_page_or_json(scene, capsys):
     assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said
     found = ps.info(scene)
     assert said.startswith(f"{scene}: 3DGS PLY, {bytes_text(scene.stat().st_size)}\n")
-    assert f"\nup: {found.up_text}" in said and f"\nfill: {found.fill:.1f} Gaussians drawn per pixel, in 12 v" in said
+    assert (
+        f"\nup: {found.up_text}" in said
+        and f"\nfill: {found.fill:.1f} Gaussians drawn per pixel, in 12 v" in said
+    )
     run("info", scene, "--json")
     assert json.loads(capsys.readouterr().out) == found.as_dict()
 
@@ -58,7 +64,10 @@ def test_info_of_several_files_is_a_table(scene, tmp_path, capsys):
         [row] = [line for line in said.splitlines() if str(path) in line]
         cells = [cell.strip() for cell in row.strip("│").split("│")]
         size = three_digits(found.bytes / 1e6)
-        assert cells[:4] == [str(path), found.format, size, f"{found.gaussians:,}"] and cells[5] == found.up_text
+        assert (
+            cells[:4] == [str(path), found.format, size, f"{found.gaussians:,}"]
+            and cells[5] == found.up_text
+        )
     run("info", scene, other, "--json")
     assert json.loads(capsys.readouterr().out) == [found.as_dict() for found in infos]
     refusal(capsys, tmp_path, "info", scene, other, "--views", tmp_path / "sheet.png")

@@ -27,7 +27,10 @@ from pointsplat_ns.io.formats import format_like, format_to_read
 def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("folder") / "rooms"
     for seed in (1, 2):
-        ps.save(ball(120 + seed, seed=seed, log_size=-1.0, opacity=1.0, bright=1.0), folder / f"room{seed}.ply")
+        ps.save(
+            ball(120 + seed, seed=seed, log_size=-1.0, opacity=1.0, bright=1.0),
+            folder / f"room{seed}.ply",
+        )
     return folder
 
 
@@ -42,14 +45,18 @@ def test_every_scene_is_what_compact_makes_of_it_and_a_table_says_so(folder, cap
         result = ps.compact(folder / f"room{seed}.ply", "50%", effort="instant")
         assert same(ps.load(small / f"room{seed}.ply"), result.scene)
         row = next(line for line in said.splitlines() if f"room{seed}" in line)
-        assert all(text in row for text in (f"{120 + seed}", f"{len(result.scene)}", f"{result.psnr:.1f}", "done"))
+        assert all(
+            text in row
+            for text in (f"{120 + seed}", f"{len(result.scene)}", f"{result.psnr:.1f}", "done")
+        )
     assert said.endswith(f"{small}: 2 of 2 scenes, and the table scenes.csv\n")
     run("compact", folder, *OPTIONS, "--keep", "0.5")
     assert capsys.readouterr().out.count("done before") == 2
 
 
 def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
-    scenes, small = tmp_path / "scenes", tmp_path / "small"
+    scenes = tmp_path / "scenes"
+    small = tmp_path / "small"
     scene = ps.load(folder / "room1.ply")
     for name in ("a.ply", "d.splat", "f.spz", "f.ply"):
         ps.save(scene, scenes / name)
@@ -61,14 +68,20 @@ def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
     assert written == {"a.ply": "a.ply", "d.splat": "d.splat", **renamed}
     for result in results:
         path = Path(result["output"])
-        assert len(ps.load(path)) == result["after"] == 61 and path.stat().st_size == result["megabytes"] * 1e6
+        assert (
+            len(ps.load(path)) == result["after"] == 61
+            and path.stat().st_size == result["megabytes"] * 1e6
+        )
         assert format_to_read(path) is format_like(Path(result["source"])) is not None
 
 
 @pytest.mark.parametrize(
     "words, said",
     [
-        (("compact", "rooms", "--poses", "a.json"), "--poses is for one scene; rooms is a folder of scenes"),
+        (
+            ("compact", "rooms", "--poses", "a.json"),
+            "--poses is for one scene; rooms is a folder of scenes",
+        ),
         (("compact", "rooms", "-o", "rooms"), "rooms: holds the scenes themselves"),
         (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs is for a folder"),
         (("compact", "empty"), "empty: no scene below it"),
@@ -79,20 +92,36 @@ def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
         (("clean", "rooms"), "take a folder of scenes"),
     ],
 )
-def test_what_does_not_fit_a_folder_is_refused_in_one_line(words, said, folder, tmp_path, monkeypatch, capsys):
+def test_what_does_not_fit_a_folder_is_refused_in_one_line(
+    words, said, folder, tmp_path, monkeypatch, capsys
+):
     (tmp_path / "rooms").symlink_to(folder)
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path)
     assert said in refusal(capsys, tmp_path, *words)
 
 
-def test_a_gallery_shows_each_scene_before_and_after_or_why_not(folder, tmp_path, monkeypatch, capsys):
+def test_a_gallery_shows_each_scene_before_and_after_or_why_not(
+    folder, tmp_path, monkeypatch, capsys
+):
     """Also after an interruption, from what is finished; the same command completes it."""
-    scenes, page, sheet = tmp_path / "my scenes", tmp_path / "shown" / "all.html", tmp_path / "all.png"
+    scenes = tmp_path / "my scenes"
+    page = tmp_path / "shown" / "all.html"
+    sheet = tmp_path / "all.png"
     for name in ("a <b>.ply", "deep/c.spz", "later.ply"):
         ps.save(ps.load(folder / "room1.ply"), scenes / name)
     (scenes / "bad.ply").write_bytes((scenes / "later.ply").read_bytes()[:-9])
-    words = ("compact", scenes, "-o", tmp_path / "small", *OPTIONS, "--html", page, "--picture", sheet)
+    words = (
+        "compact",
+        scenes,
+        "-o",
+        tmp_path / "small",
+        *OPTIONS,
+        "--html",
+        page,
+        "--picture",
+        sheet,
+    )
     compact_scene = folders.compact_scene
 
     def interrupted(dense, *given):
@@ -105,27 +134,46 @@ def test_a_gallery_shows_each_scene_before_and_after_or_why_not(folder, tmp_path
         run(*words)
     assert end.value.code == 130
     first = page.read_text("utf-8")
-    assert "2 of 4 scenes" in first and "not finished" in first and "later.ply" not in first.replace("later</h2>", "")
+    assert (
+        "2 of 4 scenes" in first
+        and "not finished" in first
+        and "later.ply" not in first.replace("later</h2>", "")
+    )
     monkeypatch.setattr(folders, "compact_scene", compact_scene)
     with pytest.raises(SystemExit):
         run(*words)
     said = capsys.readouterr().out
-    assert said.endswith(f"scenes.csv\n{page}: all scenes before and after\n{sheet}: all scenes before and after\n")
-    text, parts = page.read_text("utf-8"), parts_of(page)
+    assert said.endswith(
+        f"scenes.csv\n{page}: all scenes before and after\n{sheet}: all scenes before and after\n"
+    )
+    text = page.read_text("utf-8")
+    parts = parts_of(page)
     assert "3 of 4 scenes" in text and "not finished" not in text and "bad.ply: truncated" in text
     links = [a["href"] for tag, a in parts.elements if tag == "a"]
     assert links == ["../small/a%20%3Cb%3E.ply", "../small/deep/c.spz", "../small/later.ply"]
-    assert all((page.parent / unquote(link)).is_file() for link in links) and "<h2>a &lt;b&gt;</h2>" in text
+    assert (
+        all((page.parent / unquote(link)).is_file() for link in links)
+        and "<h2>a &lt;b&gt;</h2>" in text
+    )
     pictures = [a["src"] for tag, a in parts.elements if tag == "img"]
-    assert len(pictures) == 3 and all(picture.startswith("data:image/webp;base64,") for picture in pictures)
+    assert len(pictures) == 3 and all(
+        picture.startswith("data:image/webp;base64,") for picture in pictures
+    )
     assert text.count("Before: 121 Gaussians, ") == 3 and text.count("After: 61 Gaussians, ") == 3
     with Image.open(sheet) as picture:
         assert picture.size == (1280, 1200)
-        before, after = (np.asarray(picture.crop((x, 400, x + 640, 800)).resize((64, 40)), float) for x in (0, 640))
-    assert before.std() > 20 and 0 < abs(before - after).mean() < 60, "the same view of another scene"
+        before, after = (
+            np.asarray(picture.crop((x, 400, x + 640, 800)).resize((64, 40)), float)
+            for x in (0, 640)
+        )
+    assert before.std() > 20 and 0 < abs(before - after).mean() < 60, (
+        "the same view of another scene"
+    )
     page.unlink()
     (tmp_path / "small" / "pointsplat-scenes.json").unlink()
-    assert "all.png: exists already" in refusal(capsys, tmp_path, *words), "it may be a picture of the user's"
+    assert "all.png: exists already" in refusal(capsys, tmp_path, *words), (
+        "it may be a picture of the user's"
+    )
 
 
 INTERRUPTED = """
@@ -139,11 +187,16 @@ main(["compact", sys.argv[1], "-o", sys.argv[2], "--keep", "50%", "--seconds", "
 def test_ctrl_c_stops_all_processes_at_once_and_leaves_nothing_unfinished(folder, tmp_path):
     small = tmp_path / "small"
     process = subprocess.Popen(
-        [sys.executable, "-c", INTERRUPTED, str(folder), str(small)], start_new_session=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [sys.executable, "-c", INTERRUPTED, str(folder), str(small)],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     deadline = time.monotonic() + 300
-    while len(psutil.Process(process.pid).children()) < 3:  # two, and multiprocessing's tracker of resources
+    while (
+        len(psutil.Process(process.pid).children()) < 3
+    ):  # two, and multiprocessing's tracker of resources
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.05)
     small.mkdir(exist_ok=True)

@@ -79,7 +79,10 @@ def test_output_that_nobody_can_take_ends_without_a_traceback(where):
 
 @pytest.mark.skipif(os.name != "posix", reason="closes file descriptors as a POSIX shell does")
 def test_streams_that_are_closed_go_nowhere_and_no_file_gets_their_numbers(tmp_path):
-    script = "from pointsplat_ns.cli import main; main(['--version']); assert open('file', 'w').fileno() > 2"
+    script = (
+        "from pointsplat_ns.cli import main; main(['--version']); assert open('file', "
+        "'w').fileno() > 2"
+    )
     line = f"{shlex.quote(sys.executable)} -c {shlex.quote(script)} <&- >&- 2>&-"
     subprocess.run(["sh", "-c", line], cwd=tmp_path, check=True)
 
@@ -91,7 +94,12 @@ ORDERS = "\x1b]0;pwned\x07\x9b31m\x08\x1b[2J"
 def commanding(folder: Path) -> None:
     properties = b"x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
     names = [*properties, b"odd" + ORDERS.encode("latin-1")]
-    header = [b"ply", b"format ascii 1.0", b"element vertex 1", *(b"property float " + name for name in names)]
+    header = [
+        b"ply",
+        b"format ascii 1.0",
+        b"element vertex 1",
+        *(b"property float " + name for name in names),
+    ]
     (folder / f"{ORDERS}.ply").write_bytes(b"\n".join([*header, b"end_header", b"1 " * len(names)]))
     (folder / f"bad{ORDERS}.spz").touch()
 
@@ -99,11 +107,17 @@ def commanding(folder: Path) -> None:
 @pytest.mark.parametrize(
     "words, shown",
     [
-        (("info", f"{ORDERS}.ply"), r"\x08\x1b[2J.ply: not read: the vertex properties odd\x1b]0;pwned\x07"),
+        (
+            ("info", f"{ORDERS}.ply"),
+            r"\x08\x1b[2J.ply: not read: the vertex properties odd\x1b]0;pwned\x07",
+        ),
         (("info", f"bad{ORDERS}.spz"), r"error: bad\x1b]0;pwned\x07"),
         (("info", "new\nline.ply"), r"error: new\nline.ply: no such file"),
         (("convert", f"{ORDERS}.ply", f"made{ORDERS}.ply"), r"made\x1b]0;pwned\x07\x9b31m\x08"),
-        (("compact", ".", "-o", f"out{ORDERS}", "--keep", "1", "--effort", "instant"), r"out\x1b]0;pwned\x07"),
+        (
+            ("compact", ".", "-o", f"out{ORDERS}", "--keep", "1", "--effort", "instant"),
+            r"out\x1b]0;pwned\x07",
+        ),
         (("nonsense" + ORDERS,), r"nonsense\x1b]0;pwned"),
     ],
 )
@@ -120,14 +134,19 @@ def test_no_name_steers_the_terminal(words, shown, tmp_path, monkeypatch, capsys
 def test_every_command_has_examples_of_itself(capsys):
     with pytest.raises(SystemExit) as end:
         main(["--help"])
-    listed = re.search(r"usage: pointsplat \[-h\] \{([\w,-]+)\}", capsys.readouterr().out)[1].split(",")
+    listed = re.search(r"usage: pointsplat \[-h\] \{([\w,-]+)\}", capsys.readouterr().out)[1].split(
+        ","
+    )
     assert not end.value.code and listed == [*EXAMPLES]
     for name, examples in EXAMPLES.items():
-        assert examples and all(shlex.split(command)[:2] == ["pointsplat", name] for _, command in examples)
+        assert examples and all(
+            shlex.split(command)[:2] == ["pointsplat", name] for _, command in examples
+        )
 
 
 @pytest.mark.parametrize(
-    ("words", "why"), [("prune room.ply --keeep 10%", "--keeep"), ("view a.ply --port 1.5", "is no whole number")]
+    ("words", "why"),
+    [("prune room.ply --keeep 10%", "--keeep"), ("view a.ply --port 1.5", "is no whole number")],
 )
 def test_a_command_line_that_is_not_understood_has_status_2(words, why, capsys):
     with pytest.raises(SystemExit) as end:

@@ -42,14 +42,30 @@ def here(tmp_path, monkeypatch):
         ("a.ckpt", ("convert", "a.ckpt", "b.ply"), "a.ckpt: not a regular file"),
         ("sog/meta.json", ("info", "sog/meta.json"), "meta.json: not a regular file"),
         ("run/config.yml", ("export", "run", "-o", "b.ply"), "expected a scene"),
-        ("a.json", ("prune", *ROOM, "--poses", "a.json", "--keep", "auto"), "a.json: not a regular file"),
-        ("model/cameras.bin", ("prune", *ROOM, "--poses", "model", "--keep", "auto"), "model: a folder without"),
-        ("a.safetensors", ("compact", *ROOM, "--refiner", "a.safetensors"), "a.safetensors: not a regular file"),
-        ("out/pointsplat-scenes.json", ("compact", ".", "-o", "out"), "pointsplat-scenes.json: cannot be read ("),
+        (
+            "a.json",
+            ("prune", *ROOM, "--poses", "a.json", "--keep", "auto"),
+            "a.json: not a regular file",
+        ),
+        (
+            "model/cameras.bin",
+            ("prune", *ROOM, "--poses", "model", "--keep", "auto"),
+            "model: a folder without",
+        ),
+        (
+            "a.safetensors",
+            ("compact", *ROOM, "--refiner", "a.safetensors"),
+            "a.safetensors: not a regular file",
+        ),
+        (
+            "out/pointsplat-scenes.json",
+            ("compact", ".", "-o", "out"),
+            "pointsplat-scenes.json: cannot be read (",
+        ),
         ("b.ply", ("prune", *ROOM, "-o", "b.ply", "--force"), "b.ply: not a regular file"),
         ("a", ("prune", *ROOM, "-o", "/dev/stdout"), "/dev/stdout: cannot write a nameless file"),
     ],
-)  # fmt: skip
+)
 def test_a_pipe_is_refused_in_one_line(pipe, words, said, capsys):
     Path(pipe).parent.mkdir(parents=True, exist_ok=True)
     os.mkfifo(pipe)
@@ -83,7 +99,9 @@ def test_a_pipe_is_refused_in_one_line(pipe, words, said, capsys):
 def test_odd_files_and_values_are_one_line(words, capsys):
     ply = Path("room.ply").read_bytes()
     Path("many.ply").write_bytes(ply.replace(b"vertex 40", b"vertex 999999999999999"))
-    Path("long.ply").write_bytes(ply.replace(b"element", b"comment " + b"x" * (1 << 21) + b"\nelement", 1))
+    Path("long.ply").write_bytes(
+        ply.replace(b"element", b"comment " + b"x" * (1 << 21) + b"\nelement", 1)
+    )
     Path("deep.json").write_text("[" * 100_000)
     Path("folder.ply").mkdir()
     Path("run").mkdir()
@@ -96,4 +114,6 @@ def test_odd_files_and_values_are_one_line(words, capsys):
         main([*words])
     error = capsys.readouterr().err
     assert end.value.code == 1 and not Path("ran").exists(), error
-    assert [line.startswith("error: ") for line in error.splitlines()].count(True) == 1 and "Traceback" not in error
+    assert [line.startswith("error: ") for line in error.splitlines()].count(
+        True
+    ) == 1 and "Traceback" not in error

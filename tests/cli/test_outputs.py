@@ -22,7 +22,8 @@ FAILING = (
     "tradeoff damaged.ply -o OUT",
     "render damaged.ply -o OUT",
 )
-"""Commands that fail at their work, because the scene is damaged, unless they find before that they cannot write."""
+"""Commands that fail at their work, because the scene is damaged, unless they find before that they
+cannot write."""
 
 
 @pytest.fixture(autouse=True)
@@ -48,7 +49,9 @@ WRITES = {
 
 
 @pytest.mark.parametrize("name", WRITES)
-def test_an_interrupted_write_leaves_nothing_new_and_what_was_there_stays(name, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_write_leaves_nothing_new_and_what_was_there_stays(
+    name, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     ps.save(ball(40, opacity=1.0, bright=1.0), "room.ply")
     Path(name).write_text("from before")
@@ -69,7 +72,9 @@ def test_an_interrupted_write_leaves_nothing_new_and_what_was_there_stays(name, 
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)], ids=["text", "json"])
-def test_a_repair_that_is_interrupted_is_written_and_the_status_says_so(options, tmp_path, monkeypatch, capsys):
+def test_a_repair_that_is_interrupted_is_written_and_the_status_says_so(
+    options, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     ps.save(ball(150, log_size=-1.0, opacity=1.0, bright=1.0), "room.ply")
     steps = repair.optimised
@@ -80,7 +85,9 @@ def test_a_repair_that_is_interrupted_is_written_and_the_status_says_so(options,
 
     monkeypatch.setattr(repair, "optimised", interrupted)
     with pytest.raises(SystemExit) as end:
-        main(["compact", "room.ply", "--keep", "50%", "--by", "opacity", "--seconds", "60", *options])
+        main(
+            ["compact", "room.ply", "--keep", "50%", "--by", "opacity", "--seconds", "60", *options]
+        )
     out, err = capsys.readouterr()
     assert end.value.code == 130 and err.endswith("interrupted\n")
     assert "room_compact.ply" in out and len(ps.load("room_compact.ply")) == 75

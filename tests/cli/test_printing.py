@@ -1,4 +1,5 @@
-"""``--json``: standard output has one JSON value, which says what was written; and what a pipe gets otherwise."""
+"""``--json``: standard output has one JSON value, which says what was written; and what a pipe gets
+otherwise."""
 
 import json
 import logging
@@ -37,7 +38,8 @@ def as_json(capsys):
 
 def written(result: dict) -> ps.Gaussians:
     """The scene that a result names, after what is said of it was compared with it."""
-    scene, file = ps.load(result["output"]), Path(result["output"])
+    scene = ps.load(result["output"])
+    file = Path(result["output"])
     assert (result["gaussians"], result["sh_degree"]) == (len(scene), scene.sh_degree)
     assert result["bytes"] == file.stat().st_size and result["seconds"] > 0
     return scene
@@ -61,7 +63,9 @@ def test_lod_and_tradeoff_print_their_files(ply, as_json, tmp_path, monkeypatch)
         **json.loads(Path("room_lod/lod.json").read_text("utf-8")),
     }
     views = sample_views(box_room(0, COUNT), 2, 24, 18)
-    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count])
+    monkeypatch.setattr(
+        view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count]
+    )
     few = ("--views", "2", "--repairs", "none", "--keep", "10%")
     assert as_json("tradeoff", ply, *few) == {
         "output": "room_tradeoff",
@@ -76,7 +80,10 @@ def test_lod_prints_the_size_of_what_it_writes_and_of_no_ply(form, ply, capsys):
     path = Path(re.search(r"(?m)^(.+): 2 levels of ", said)[1])
     files = [file for file in (path, *path.rglob("*")) if file.is_file()]
     assert f", {bytes_text(sum(file.stat().st_size for file in files))} in all" in said
-    assert [line.split("│")[4].strip() for line in said.splitlines() if "level_" in line] == ["-", "-"]
+    assert [line.split("│")[4].strip() for line in said.splitlines() if "level_" in line] == [
+        "-",
+        "-",
+    ]
 
 
 def test_what_libraries_print_and_what_is_found_go_to_standard_error(ply, capsys, monkeypatch):

@@ -54,29 +54,44 @@ def test_details_are_said_where_they_are_asked_for(ply, capsys):
     ("options", "message"),
     [
         (("--by", "best"), f"no method is called 'best'; expected one of {', '.join(METHODS)}"),
-        (("--by", "merge", "--opacity-weight", "0.5"), "opacity weight 0.5: merge does not weigh opacity"),
+        (
+            ("--by", "merge", "--opacity-weight", "0.5"),
+            "opacity weight 0.5: merge does not weigh opacity",
+        ),
         (("--keep", "half"), "keep is 'half'"),
     ],
 )
-def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, message, tmp_path, capsys):
+def test_options_that_fit_no_scene_are_refused_before_one_is_read(
+    options, message, tmp_path, capsys
+):
     (tmp_path / "damaged.ply").touch()
     assert message in refusal(capsys, tmp_path, "prune", tmp_path / "damaged.ply", *options)
 
 
 @pytest.mark.parametrize("named", ["folder", "ckpt seen from its folder"])
-def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named, trained_walls, tmp_path, monkeypatch):
+def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(
+    named, trained_walls, tmp_path, monkeypatch
+):
     folder = tmp_path / "run"
     shutil.copytree(run_of(trained_walls, "wall-a"), folder)
     before = sorted(folder.rglob("*"))
     (checkpoint,) = (folder / "nerfstudio_models").iterdir()
     monkeypatch.chdir(checkpoint.parent)
-    run("prune", folder if named == "folder" else checkpoint.name, "--keep", "10%", "--by", "opacity")
+    run(
+        "prune",
+        folder if named == "folder" else checkpoint.name,
+        "--keep",
+        "10%",
+        "--by",
+        "opacity",
+    )
     assert set(folder.rglob("*")) - set(before) == {folder / "pruned.ply"}
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
 def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(tmp_path, capsys, suffix):
-    room, scene = tmp_path / "room.ply", ball(300, opacity=1.0, bright=1.0)
+    room = tmp_path / "room.ply"
+    scene = ball(300, opacity=1.0, bright=1.0)
     write_ply(scene, room)
     poses = written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")
     run("prune", room, "--keep", "2MB", "--poses", poses, "-o", tmp_path / f"small{suffix}")
@@ -88,7 +103,8 @@ def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(tmp_path, c
 
 def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(prune_file, "MEMORY", prune_file.MemorySettings(base=0, least=100))
-    scene, small = tmp_path / "scene.ply", tmp_path / "small.ply"
+    scene = tmp_path / "scene.ply"
+    small = tmp_path / "small.ply"
     write_ply(normal_scene(900, degree=1, seed=SEED), scene)
     run("prune", scene, "--keep", "10%", "--sh", "0", "--memory", "200kB", "-o", small, "--json")
     said = json.loads(capsys.readouterr().out)
@@ -107,9 +123,13 @@ def test_where_memory_is_short_a_scene_is_merged_in_parts_unasked(tmp_path, caps
     assert "not compared" not in capsys.readouterr().out
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free._replace(available=440_000))
     run("prune", tmp_path / "scene.ply", "--keep", "90", "-o", tmp_path / "parts.ply")
-    assert "not compared with the dense scene: it does not fit into memory" in capsys.readouterr().out
+    assert (
+        "not compared with the dense scene: it does not fit into memory" in capsys.readouterr().out
+    )
     assert len(read_ply(tmp_path / "parts.ply")) == 90
-    run("prune", tmp_path / "scene.ply", "--by", "opacity", "-o", tmp_path / "score.ply")  # needs less, as before
+    run(
+        "prune", tmp_path / "scene.ply", "--by", "opacity", "-o", tmp_path / "score.ply"
+    )  # needs less, as before
 
 
 PROGRAM = """
@@ -122,11 +142,17 @@ main(["prune", "scene.ply", "--keep", "10%", *sys.argv[2:]])
 
 
 def pruned(folder: Path, *words: object, killed_at: int = 0) -> tuple[int, str]:
-    """Exit status and text of a command, killed after some of its first process's steps unless that is 0."""
+    """Exit status and text of a command, killed after some of its first process's steps unless that
+    is 0."""
     done = subprocess.run(
-        [sys.executable, "-c", KILLED_AFTER_STEPS + PROGRAM, f"{killed_at}", *map(str, words)], cwd=folder,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300, env=quick_start(),
-    )  # fmt: skip
+        [sys.executable, "-c", KILLED_AFTER_STEPS + PROGRAM, f"{killed_at}", *map(str, words)],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=300,
+        env=quick_start(),
+    )
     return done.returncode, done.stdout
 
 
@@ -150,4 +176,6 @@ def test_several_jobs_for_a_scene_that_fits_into_memory_are_refused(tmp_path, ca
     words = ("prune", tmp_path / "scene.ply", "--keep", "10%", "--jobs")
     fits = "scene.ply: fits into memory; --jobs is for a scene that is merged in parts"
     assert fits in refusal(capsys, tmp_path, *words, 2)
-    assert "jobs is 0; expected 1 or more" in refusal(capsys, tmp_path, *words, 0, "--memory", "10kB")
+    assert "jobs is 0; expected 1 or more" in refusal(
+        capsys, tmp_path, *words, 0, "--memory", "10kB"
+    )

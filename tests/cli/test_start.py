@@ -27,30 +27,52 @@ program()
 def test_ctrl_c_while_the_program_is_imported_is_one_word(name, tmp_path):
     (tmp_path / "room.ply").touch()
     words = INTERRUPTED.replace("sys.argv[1]:", f"{name!r}:").replace("sys.argv[1]]", f"{name!r}]")
-    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, cwd=tmp_path
+    )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
 def test_next_to_nothing_is_imported_before_ctrl_c_is_caught():
-    code = "import sys; before = {*sys.modules}; import pointsplat_ns.start; print(*sorted({*sys.modules} - before))"
+    code = (
+        "import sys; before = {*sys.modules}; import pointsplat_ns.start; "
+        "print(*sorted({*sys.modules} - before))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    by_python = {"__future__", "importlib", "importlib._bootstrap", "importlib._bootstrap_external", "warnings"}
+    by_python = {
+        "__future__",
+        "importlib",
+        "importlib._bootstrap",
+        "importlib._bootstrap_external",
+        "warnings",
+    }
     assert {*done.stdout.split()} - by_python == {"pointsplat_ns", "pointsplat_ns.start"}
 
 
 def test_files_that_are_missing_are_all_named_before_torch_is_imported(tmp_path):
-    alone = [*(f"{name} a.ply" for name in ("prune", "compact", "clean", "lod", "tradeoff")), "convert a.ply b.spz"]
+    alone = [
+        *(f"{name} a.ply" for name in ("prune", "compact", "clean", "lod", "tradeoff")),
+        "convert a.ply b.spz",
+    ]
     alone += ["export a.ply -o b.ply"]
     both = ["info a.ply b.ply", "render a.ply b.ply", "view a.ply b.ply"]
     script = (
         "import sys\nclass NoTorch:\n    def find_spec(self, name, *_): assert name != 'torch'\n"
         "sys.meta_path.insert(0, NoTorch())\nfrom pointsplat_ns.cli import main\n"
-        f"for words in {[*alone, *both]}:\n    try: main(words.split())\n    except SystemExit: pass"
+        f"for words in {[*alone, *both]}:\n    try: main(words.split())\n    except SystemExit: "
+        "pass"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path)
-    expected = "; expected a scene: a file of any format, a checkpoint, or a run (its folder or config.yml)"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path
+    )
+    expected = (
+        "; expected a scene: a file of any format, a checkpoint, or a run (its folder or "
+        "config.yml)"
+    )
     said = [f"error: a.ply: no such file{expected}"] * len(alone)
-    assert done.stderr.splitlines() == said + [f"error: a.ply, b.ply: no such files{expected}"] * len(both)
+    assert done.stderr.splitlines() == said + [
+        f"error: a.ply, b.ply: no such files{expected}"
+    ] * len(both)
     assert (done.returncode, done.stdout, [*tmp_path.iterdir()]) == (0, "", [])
 
 
@@ -60,20 +82,32 @@ def test_too_little_address_space_for_torch_is_one_line(tmp_path):
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (10**9, 10**9))
 
-    words = [sys.executable, "-c", "from pointsplat_ns.start import program; program()", "info", "room.ply"]
+    words = [
+        sys.executable,
+        "-c",
+        "from pointsplat_ns.start import program; program()",
+        "info",
+        "room.ply",
+    ]
     (tmp_path / "room.ply").touch()
     done = subprocess.run(words, capture_output=True, text=True, preexec_fn=limit, cwd=tmp_path)
-    assert done.returncode == 1 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert (
+        done.returncode == 1 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    )
     assert "; torch takes 4 GB of address space (ulimit -v)" in done.stderr
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        ["prune", ""], ["compact", "", "--keep", "10%"], ["convert", "a.ply", ""], ["view", ""],
-        ["lod", "a.ply", "-o", ""], ["prune", "a.ply", "--poses", ""],
+        ["prune", ""],
+        ["compact", "", "--keep", "10%"],
+        ["convert", "a.ply", ""],
+        ["view", ""],
+        ["lod", "a.ply", "-o", ""],
+        ["prune", "a.ply", "--poses", ""],
     ],
-)  # fmt: skip
+)
 def test_an_empty_path_is_not_the_current_folder(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as end:

@@ -45,12 +45,16 @@ def test_the_scene_itself_is_not_wrong_at_any_size_and_a_wider_one_is(scene, vie
 
 def test_an_error_of_opacity_alone_counts_on_some_background(scene, views):
     """Black Gaussians before black: their opacity does not show, and it does before white."""
-    black = scene.replace(features_dc=torch.full_like(scene.features_dc, -10.0), features_rest=scene.features_rest * 0)
+    black = scene.replace(
+        features_dc=torch.full_like(scene.features_dc, -10.0), features_rest=scene.features_rest * 0
+    )
     renders = RendersOfSizes(black, views, sides_of(640, 480))
     assert renders.psnr(black.replace(opacities=black.opacities - 1)) < 50
 
 
-@pytest.mark.parametrize("text", ["", "1920", "0x5", "1920x1080x3", "-3x4", "axb", "99999x10", "1.5x2", (3,), (0, 4)])
+@pytest.mark.parametrize(
+    "text", ["", "1920", "0x5", "1920x1080x3", "-3x4", "axb", "99999x10", "1.5x2", (3,), (0, 4)]
+)
 def test_what_is_no_resolution_is_refused(text):
     with pytest.raises(PointSplatError, match="expected width and height in pixels"):
         parse_resolution(text)
@@ -60,7 +64,9 @@ SCENE = cloud(200)
 
 
 def test_closeness_is_that_of_the_metrics_over_covered_pixels(hollow_ball, ball_views):
-    reference, kept, shares = DenseReference(hollow_ball, ball_views), hollow_ball[:900], []
+    reference = DenseReference(hollow_ball, ball_views)
+    kept = hollow_ball[:900]
+    shares = []
     close = reference.closeness(kept, shares.append)
     pictures = torch.stack([render(kept, ball_views[i]) for i in range(4)]).double()
     wanted = torch.stack(reference.renders).double()
@@ -70,11 +76,15 @@ def test_closeness_is_that_of_the_metrics_over_covered_pixels(hollow_ball, ball_
     # 1e-5: shares in float32 here, and float64 means, summed in another order
     assert close.psnr == pytest.approx(float(overall), abs=1e-5)
     assert close.worst == pytest.approx(float(each.min()), abs=1e-5) and close.worst < close.psnr
-    assert reference.ssim(kept) == pytest.approx(float(ssim(pictures, wanted).mean()), abs=1e-5)  # float32 there
+    assert reference.ssim(kept) == pytest.approx(
+        float(ssim(pictures, wanted).mean()), abs=1e-5
+    )  # float32 there
     assert reference.psnr(kept) == (close.psnr, close.worst) and shares == [0.25, 0.5, 0.75, 1.0]
     assert reference.closeness_of(render(kept, view) for view in ball_views) == close
     itself = reference.closeness(hollow_ball)
-    assert itself.psnr == itself.worst == math.inf and reference.ssim(hollow_ball) == pytest.approx(1.0)
+    assert itself.psnr == itself.worst == math.inf and reference.ssim(hollow_ball) == pytest.approx(
+        1.0
+    )
 
 
 @pytest.mark.parametrize("both_backgrounds", [False, True])
@@ -90,7 +100,9 @@ def test_empty_margins_bring_nothing_closer(both_backgrounds):
 
 def test_what_is_covered_is_where_the_background_does_not_show():
     views = _ahead()
-    white, black = (dataclasses.replace(views, background=torch.full((3,), value)) for value in (1.0, 0.0))
+    white, black = (
+        dataclasses.replace(views, background=torch.full((3,), value)) for value in (1.0, 0.0)
+    )
     shows_through = float((render(SCENE, white) - render(SCENE, black)).mean())
     [covered] = DenseReference(SCENE, views).covered
     assert covered == pytest.approx(1 - shows_through, abs=1e-3) and 0.05 < covered < 0.5
@@ -101,7 +113,9 @@ def test_where_the_dense_scene_covers_nothing_all_pixels_count():
     nothing = DenseReference(SCENE, behind)
     assert nothing.covered == (0.0,) and nothing.psnr(SCENE)[0] == math.inf
     moved = SCENE.replace(means=SCENE.means + torch.tensor([0.0, 0.0, 10.0]))
-    assert nothing.psnr(moved)[0] == pytest.approx(float(psnr(render(moved, behind[0]), nothing.renders[0])), abs=1e-4)
+    assert nothing.psnr(moved)[0] == pytest.approx(
+        float(psnr(render(moved, behind[0]), nothing.renders[0])), abs=1e-4
+    )
 
 
 def _ahead(distance: float = 5.0) -> Views:

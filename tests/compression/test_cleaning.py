@@ -1,4 +1,5 @@
-"""Cleaning: planted junk goes, what is seen stays, counts are exact, and extremes change nothing."""
+"""Cleaning: planted junk goes, what is seen stays, counts are exact, and extremes change
+nothing."""
 
 import functools
 import math
@@ -11,7 +12,13 @@ import pointsplat_ns as ps
 from making import box_room, same_bits, splats
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression import cleaning
-from pointsplat_ns.compression.cleaning import FLOATING, PLACES, clean_scene, find_junk, floating_scores
+from pointsplat_ns.compression.cleaning import (
+    FLOATING,
+    PLACES,
+    clean_scene,
+    find_junk,
+    floating_scores,
+)
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
@@ -23,12 +30,15 @@ from pointsplat_ns.views import Views
 
 pytestmark = pytest.mark.usefixtures("usual_looking")
 
-ROOM, THINGS, PLANTED = 5500, 3000, 12
+ROOM = 5500
+THINGS = 3000
+PLANTED = 12
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_places() -> Iterator[None]:
-    """Four places instead of sixteen, in a quarter of the time, for tests of what does not depend on their number."""
+    """Four places instead of sixteen, in a quarter of the time, for tests of what does not depend
+    on their number."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cleaning, "PLACES", 4)
         yield
@@ -36,9 +46,10 @@ def few_places() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def room() -> Gaussians:
-    """Opaque walls of many layers, through which nothing shines, and small things before them, which are seen from
-    inside."""
-    walls, things = box_room(0, ROOM - THINGS, size=0.2), box_room(1, THINGS, size=0.03)
+    """Opaque walls of many layers, through which nothing shines, and small things before them,
+    which are seen from inside."""
+    walls = box_room(0, ROOM - THINGS, size=0.2)
+    things = box_room(1, THINGS, size=0.03)
     whole = Gaussians.cat([walls, things.replace(means=0.8 * things.means)])
     return whole.replace(opacities=torch.full((ROOM, 1), 9.0))
 
@@ -53,7 +64,8 @@ blobs = functools.partial(splats, colours=1.0, degree=1)
 
 
 def behind_the_walls(n: int = PLANTED) -> torch.Tensor:
-    """Points one unit beyond the walls that face along x, (n, 3). The walls are at 2 and about 0.5 thick."""
+    """Points one unit beyond the walls that face along x, (n, 3). The walls are at 2 and about 0.5
+    thick."""
     side = torch.where(torch.arange(n) % 2 == 0, 1.0, -1.0)
     spread = torch.linspace(-0.8, 0.8, n)
     return torch.stack([3.2 * side, spread, spread.flip(0) * 0.5], dim=1)
@@ -73,7 +85,8 @@ def junk_of(scene: Gaussians) -> tuple[list[int], list[int]]:
 
 
 def with_junk(room: Gaussians) -> Gaussians:
-    """The room, then floaters and haze behind its walls, then what cannot be drawn: one NaN and one too faint."""
+    """The room, then floaters and haze behind its walls, then what cannot be drawn: one NaN and one
+    too faint."""
     bad = blobs(torch.tensor([[math.nan, 0.0, 0.0], [0.0, 0.0, 0.0]]), -2.0, -9.0)
     return Gaussians.cat([room, JUNK["floaters"], JUNK["haze"], bad])
 
@@ -108,9 +121,15 @@ def test_what_cannot_be_drawn_goes_the_meaningless_first(room):
     ("scene", "most"),
     [
         (box_room(0, 30).replace(scales=torch.full((30, 3), 80.0)), 29),
-        # The first of opacity 0.98 let 2 % through each; when a ten-thousandth is left the others are not drawn.
+        # The first of opacity 0.98 let 2 % through each; when a ten-thousandth is left the others
+        # are not drawn.
         (box_room(0, 30).replace(means=torch.zeros(30, 3), scales=torch.full((30, 3), -1.0)), 28),
-        (box_room(0, 30).replace(means=torch.full((30, 3), 1e30), scales=torch.full((30, 3), -1.0)), 28),
+        (
+            box_room(0, 30).replace(
+                means=torch.full((30, 3), 1e30), scales=torch.full((30, 3), -1.0)
+            ),
+            28,
+        ),
     ],
     ids=["giants without end", "in one place", "in one place far away"],
 )
@@ -119,7 +138,9 @@ def test_of_alike_ones_those_that_show_stay(scene, most):
     assert undrawable == [] and len(unseen) <= most
 
 
-@pytest.mark.parametrize(("by", "keep"), [("merge", 0.3), ("merge", 0.999), ("opacity", 1), ("opacity", 1.0)])
+@pytest.mark.parametrize(
+    ("by", "keep"), [("merge", 0.3), ("merge", 0.999), ("opacity", 1), ("opacity", 1.0)]
+)
 def test_keep_refers_to_the_scene_as_read_and_is_exact(by, keep, room, views):
     scene = with_junk(room)[:-2] if by == "merge" else with_junk(room)
     result = prune_scene(scene, PruneRequest(keep, by, clean=True), ViewSource(scene, given=views))
@@ -152,7 +173,8 @@ def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
 
 
 def before_a_wall(unit: float = 1.0) -> tuple[Gaussians, Views]:
-    """A grey wall at 4, and before it, at 1, haze of its colour, then a red opaque blob; and two views of them."""
+    """A grey wall at 4, and before it, at 1, haze of its colour, then a red opaque blob; and two
+    views of them."""
     across = torch.linspace(-4, 4, 25)
     wall = torch.cartesian_prod(across, across, torch.tensor([4.0]))
     before = torch.tensor([[-0.3, 0.0, 1.0], [0.3, 0.0, 1.0]])
@@ -178,13 +200,20 @@ def test_haze_before_a_wall_floats_and_a_red_blob_stays(unit):
 def test_what_a_given_view_shows_is_not_unseen(room):
     """A view from behind the walls, where nobody looks from otherwise."""
     scene = Gaussians.cat([room, JUNK["floaters"]])
-    viewmat = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 6.0], [0.0, 0.0, 0.0, 1.0]])
+    viewmat = torch.tensor(
+        [[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 6.0], [0.0, 0.0, 0.0, 1.0]]
+    )
     K = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]])
     behind = Views(viewmat[None].double(), K[None], 32, 32, torch.zeros(3))
     near = {*range(ROOM + 1, ROOM + PLANTED, 2)}  # those on the side of the camera
-    cleanings = [clean_scene(scene, 1, source) for source in (ViewSource(scene, given=behind), ViewSource(scene))]
+    cleanings = [
+        clean_scene(scene, 1, source)
+        for source in (ViewSource(scene, given=behind), ViewSource(scene))
+    ]
     assert [near & {*cleaning.junk.unseen.tolist()} for cleaning in cleanings] == [set(), near]
-    assert not any(len(cleaning.junk.floating) or "float" in str(cleaning.notes) for cleaning in cleanings)
+    assert not any(
+        len(cleaning.junk.floating) or "float" in str(cleaning.notes) for cleaning in cleanings
+    )
 
 
 def test_the_score_is_its_formula():
@@ -194,18 +223,29 @@ def test_the_score_is_its_formula():
     totals = torch.zeros(3, len(scene), dtype=torch.float64)
     colors = (0.5 + 0.28209479177387814 * scene.features_dc).clamp(0, 1)
     for view in views:
-        camera = {"viewmats": view.viewmat[None], "Ks": view.K[None].double(), "width": 32, "height": 24}
+        camera = {
+            "viewmats": view.viewmat[None],
+            "Ks": view.K[None].double(),
+            "width": 32,
+            "height": 24,
+        }
         shape = scene.means, scene.quats, scene.stds, scene.alphas
-        weights = ps.rasterization(*shape, torch.eye(len(scene), dtype=torch.float64), **camera)[0][0]  # [H, W, N]
+        weights = ps.rasterization(*shape, torch.eye(len(scene), dtype=torch.float64), **camera)[0][
+            0
+        ]  # [H, W, N]
         depths = scene.means[:, 2]
         shown = (weights @ depths / weights.sum(-1)).nan_to_num(1.0)
         apart = (weights @ colors)[:, :, None] - colors
         totals[0] += weights.sum((0, 1))
         totals[1] += (weights * (1 - depths / shown[..., None])).sum((0, 1))
         totals[2] += (weights * apart.square().sum(-1)).sum((0, 1))
-    free, difference = totals[1] / totals[0], (totals[2] / totals[0]).clamp_min(1e-4)
+    free = totals[1] / totals[0]
+    difference = (totals[2] / totals[0]).clamp_min(1e-4)
     expected = (difference / free).sqrt() / FLOATING
-    found = {dtype: floating_scores(scene.to(dtype), views)[0] for dtype in (torch.float32, torch.float64)}
+    found = {
+        dtype: floating_scores(scene.to(dtype), views)[0]
+        for dtype in (torch.float32, torch.float64)
+    }
     before = free > 0.01  # the wall stands before nothing, to rounding
     assert before.tolist() == [False] * (len(scene) - 2) + [True] * 2
     # float32 depths are within 1e-6 of their size, free is at least 0.01
@@ -226,7 +266,10 @@ def test_what_stands_before_nothing_never_floats(opacity):
 def test_values_that_are_not_finite_are_no_floaters():
     scene, views = before_a_wall()
     odd = blobs(torch.tensor([[0.0, 0.0, 1.0]] * 4), 0.0, 1.0)
-    odd.means[0, 0], odd.scales[1, 1], odd.opacities[2], odd.features_dc[3, 0] = math.nan, 1e4, -math.inf, 1e38
+    odd.means[0, 0] = math.nan
+    odd.scales[1, 1] = 1e4
+    odd.opacities[2] = -math.inf
+    odd.features_dc[3, 0] = 1e38
     junk = find_junk(Gaussians.cat([odd, scene]), floating=views, strength=1)
     assert set(junk.undrawable.tolist()) >= {0, 2} and not {0, 1, 2} & {*junk.floating.tolist()}
 

@@ -1,4 +1,5 @@
-"""A scene made smaller and refined: refinement is kept where it helps, left out where it does not, and it is said."""
+"""A scene made smaller and refined: refinement is kept where it helps, left out where it does not,
+and it is said."""
 
 import math
 from pathlib import Path
@@ -25,12 +26,26 @@ from pointsplat_ns.system.progress import silent
 from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
-TINY = {"enc_channels": (8, 8), "enc_depths": (1, 1), "enc_heads": (1, 1), "strides": (2,), "patch": 64}
-TINY |= {"dec_channels": (8,), "dec_depths": (1,), "dec_heads": (1,), "feature_dim": 8, "head_width": 8, "grid": None}
+TINY = {
+    "enc_channels": (8, 8),
+    "enc_depths": (1, 1),
+    "enc_heads": (1, 1),
+    "strides": (2,),
+    "patch": 64,
+}
+TINY |= {
+    "dec_channels": (8,),
+    "dec_depths": (1,),
+    "dec_heads": (1,),
+    "feature_dim": 8,
+    "head_width": 8,
+    "grid": None,
+}
 
 
 def tiny_refiner(head: str = "opacities", moved: float = 0.0, seed: int = 1, **config) -> Refiner:
-    """An untrained refiner whose residual is ``moved`` for every value of one attribute, zero for the others."""
+    """An untrained refiner whose residual is ``moved`` for every value of one attribute, zero for
+    the others."""
     torch.manual_seed(seed)
     refiner = Refiner(RefinerConfig(**{**TINY, **config})).eval()
     with torch.no_grad():
@@ -38,7 +53,9 @@ def tiny_refiner(head: str = "opacities", moved: float = 0.0, seed: int = 1, **c
     return refiner
 
 
-def trained(refiner: Refiner, keep: float | int = 0.5, by: str = "opacity", **options) -> TrainedRefiner:
+def trained(
+    refiner: Refiner, keep: float | int = 0.5, by: str = "opacity", **options
+) -> TrainedRefiner:
     return TrainedRefiner(refiner, PruneSettings(keep, by, **options), Path("in memory"))
 
 
@@ -46,7 +63,11 @@ REPAIRED = RepairBudget("quick", 1.0)
 
 
 def compacted(
-    scene: Gaussians, refiner: TrainedRefiner | None, views: Views | ViewSource | None, progress=silent, **options
+    scene: Gaussians,
+    refiner: TrainedRefiner | None,
+    views: Views | ViewSource | None,
+    progress=silent,
+    **options,
 ) -> Compacted:
     """Compacted with renders compared in the given views."""
     source = ViewSource(scene, given=views) if isinstance(views, Views) else views
@@ -58,7 +79,9 @@ def repaired_to(monkeypatch):
     """A function that makes every repair give one scene."""
 
     def give(made: Gaussians, interrupted: bool = False) -> None:
-        monkeypatch.setattr(compact_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, interrupted))
+        monkeypatch.setattr(
+            compact_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, interrupted)
+        )
 
     return give
 
@@ -83,7 +106,9 @@ def views(scene) -> Views:
 
 def test_what_is_not_finite_never_gets_out(scene, views):
     pruned = prune(scene, 0.5, "opacity")
-    refiner = tiny_refiner("features_dc", math.nan)  # the refiner itself holds back what it cannot compute
+    refiner = tiny_refiner(
+        "features_dc", math.nan
+    )  # the refiner itself holds back what it cannot compute
     result = compacted(scene, trained(refiner), views)
     assert not result.accepted and same(result.scene, pruned)
 
@@ -96,7 +121,9 @@ def test_what_is_not_finite_never_gets_out(scene, views):
     unsound = Unsound(refiner.config).eval()
     for source in (ViewSource(scene, given=views), NoViews(scene)):
         result = compacted(scene, trained(unsound), source)
-        assert not result.accepted and same(result.scene, pruned) and result.stages[-1].after is None
+        assert (
+            not result.accepted and same(result.scene, pruned) and result.stages[-1].after is None
+        )
         assert result.verdict == "not refined by the network: 7 of 200 Gaussians are not finite"
 
 
@@ -105,8 +132,8 @@ def test_without_views_refinement_is_left_out_with_the_reason(scene):
     assert not result.accepted and same(result.scene, prune(scene, 0.5, "opacity"))
     assert result.reference is None and result.views is None and result.psnr is None
     assert result.verdict == (
-        "not refined by the network: it cannot be compared with the dense scene (no free place to look at the scene "
-        "from was found)"
+        "not refined by the network: it cannot be compared with the dense scene (no free place to "
+        "look at the scene from was found)"
     )
 
 
@@ -132,7 +159,9 @@ def test_a_degree_above_the_networks_is_refused_before_anything_is_done(scene, v
         with pytest.raises(SceneError, match="has SH degree 1; .* at most 0; cut it with --sh 0"):
             compacted(scene, refiner, views, sh="1")
     assert compacted(scene, refiner, views, sh="0").scene.sh_degree == 0
-    strong = scene.replace(features_rest=scene.features_rest * 20)  # auto keeps the band: only now it is known
+    strong = scene.replace(
+        features_rest=scene.features_rest * 20
+    )  # auto keeps the band: only now it is known
     with pytest.raises(SceneError, match="SH degree 1.*at most 0"):
         compacted(strong, refiner, views, sh="auto")
 
@@ -146,16 +175,23 @@ def test_a_degree_above_the_networks_is_refused_before_anything_is_done(scene, v
     ],
     ids=["better", "worse", "not finite"],
 )
-def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(change, kept, scene, views, repaired_to):
+def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(
+    change, kept, scene, views, repaired_to
+):
     pruned = prune(scene, 0.5, "opacity")
     made = change(pruned)
     repaired_to(made, interrupted=not kept)
     result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
     assert result.repair_accepted == kept
     assert same(result.scene, made if kept else pruned)
-    assert result.psnr == DenseReference(scene, views).psnr(result.scene)[0] and result.psnr >= result.before.psnr
+    assert (
+        result.psnr == DenseReference(scene, views).psnr(result.scene)[0]
+        and result.psnr >= result.before.psnr
+    )
     line = result.verdict.splitlines()[1]
-    assert line.startswith("repaired by 5 steps in 0.5 s: " if kept else "not repaired by 5 steps in 0.5 s")
+    assert line.startswith(
+        "repaired by 5 steps in 0.5 s: " if kept else "not repaired by 5 steps in 0.5 s"
+    )
     assert ("interrupted" in line) == (not kept)
 
 
@@ -165,7 +201,9 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired
     repaired_to(pruned.replace(scales=pruned.scales + 0.1))
 
     def closeness(self, scene, progress=None):
-        return Closeness((0.9, 0.2, 0.2) if same(scene, pruned) else (0.1, 0.21, 0.21), self.covered)
+        return Closeness(
+            (0.9, 0.2, 0.2) if same(scene, pruned) else (0.1, 0.21, 0.21), self.covered
+        )
 
     monkeypatch.setattr(DenseReference, "closeness", closeness)
     result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, repair=REPAIRED)
@@ -176,7 +214,8 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired
 
 
 def test_a_repair_that_harms_pictures_of_another_size_is_left_out(scene, monkeypatch, repaired_to):
-    """Thinner Gaussians may be right in pictures of a middle size, and wrong in large ones. Little of a gain may go."""
+    """Thinner Gaussians may be right in pictures of a middle size, and wrong in large ones. Little
+    of a gain may go."""
     large = sample_views(scene, 2, 640, 480)
     pruned = prune(scene, 0.5, "opacity")
     repaired_to(pruned.replace(scales=pruned.scales + 0.1))
@@ -187,4 +226,6 @@ def test_a_repair_that_harms_pictures_of_another_size_is_left_out(scene, monkeyp
     assert compacted(scene, None, large, **options).repair_accepted
     left = compacted(scene, None, large, **options)
     assert not left.repair_accepted and same(left.scene, left.pruned)
-    assert left.verdict.startswith("not repaired by 5 steps in 0.5 s, it harms pictures of another size: ")
+    assert left.verdict.startswith(
+        "not repaired by 5 steps in 0.5 s, it harms pictures of another size: "
+    )

@@ -33,7 +33,9 @@ MEASURES = {
     "proportional": lambda count: math.log(16 * count + 500),
     "a time with a share that is always there": lambda count: math.log(5.0 + count / 1000),
     "in one step": lambda count: 20.0 if count < 12_345 else 40.0,
-    "endless for the whole": lambda count: math.inf if count == MOST else 30 + math.log(count / MOST),
+    "endless for the whole": lambda count: (
+        math.inf if count == MOST else 30 + math.log(count / MOST)
+    ),
 }
 
 
@@ -60,7 +62,9 @@ def test_the_count_meets_the_target_and_its_tried_neighbour_does_not(name, share
     meets = (lambda value: value >= target) if at_least else (lambda value: value <= target)
     assert meets(tried[found])
     missed = [count for count, value in tried.items() if not meets(value)]
-    low, high = (max(missed, default=0), found) if at_least else (found, min(missed, default=MOST + 1))
+    low, high = (
+        (max(missed, default=0), found) if at_least else (found, min(missed, default=MOST + 1))
+    )
     assert high <= max(low, 1) * 1.05 or high - low == 1 or abs(tried[found] - target) <= 1e-6
     assert len(tried) <= 20
 
@@ -96,7 +100,9 @@ def test_bounds_are_tried_before_it_gives_up():
 
 
 @pytest.mark.parametrize("wanted", [22.0, 30.0])
-def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(hollow_ball, ball_views, wanted):
+def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(
+    hollow_ball, ball_views, wanted
+):
     scores = score_of(hollow_ball, METHODS["coverage"])
     reference = DenseReference(hollow_ball, ball_views)
 
@@ -105,18 +111,30 @@ def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(hollow_b
         return reference.psnr(scene)[0], scene
 
     scene, found = smallest_within(len(hollow_ball), measure, wanted)
-    count, psnr = len(scene), reference.psnr(scene)[0]
+    count = len(scene)
+    psnr = reference.psnr(scene)[0]
     below = [k for k in found.tried if k < count]
-    assert psnr >= wanted and (psnr <= wanted + 0.1 or count <= max(max(below) * 1.05, max(below) + 1))
+    assert psnr >= wanted and (
+        psnr <= wanted + 0.1 or count <= max(max(below) * 1.05, max(below) + 1)
+    )
     assert all(found.tried[k] < wanted for k in below) and len(found.tried) <= 8
     shares = []
-    request, source = PruneRequest(WithinPsnr(wanted), "coverage"), ViewSource(hollow_ball, given=ball_views)
+    request = PruneRequest(WithinPsnr(wanted), "coverage")
+    source = ViewSource(hollow_ball, given=ball_views)
     pruned = prune_scene(
-        hollow_ball, request, source, lambda what, share: shares.append(share) if what == "trying counts" else None
+        hollow_ball,
+        request,
+        source,
+        lambda what, share: shares.append(share) if what == "trying counts" else None,
     )
-    assert same(pruned.scene, scene) and f"sizes tried: {psnr:.1f} dB against the dense scene" in pruned.notes[-1]
+    assert (
+        same(pruned.scene, scene)
+        and f"sizes tried: {psnr:.1f} dB against the dense scene" in pruned.notes[-1]
+    )
     steps = [after - before for before, after in zip([0.0, *shares], shares, strict=False)]
-    assert 0 < min(steps) and max(steps) <= 0.25 / len(ball_views) + 0.02 and shares[-1] < 1, "the bar never jumps"
+    assert 0 < min(steps) and max(steps) <= 0.25 / len(ball_views) + 0.02 and shares[-1] < 1, (
+        "the bar never jumps"
+    )
 
 
 def search(full, limit, encode=encode_spz):
@@ -131,7 +149,9 @@ def test_a_budget_for_less_than_one_gaussian_is_refused():
 
 def test_a_size_that_jumps_ends_the_search_with_what_fits():
     # Beyond 50 Gaussians the file is ten times as large.
-    scene, _, _ = search(cloud(100), 600, lambda scene, _: bytes(10 * len(scene) * (10 if len(scene) > 50 else 1)))
+    scene, _, _ = search(
+        cloud(100), 600, lambda scene, _: bytes(10 * len(scene) * (10 if len(scene) > 50 else 1))
+    )
     assert 1 <= len(scene) <= 50
 
 
@@ -147,7 +167,8 @@ def test_prune_counts_bytes_of_the_format_that_is_named(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog"])
 def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
-    full, limit = cloud(4000), FileLimit(format_to_write(suffix), 32_000)
+    full = cloud(4000)
+    limit = FileLimit(format_to_write(suffix), 32_000)
 
     def psnr_of(half: float, scene: Gaussians) -> float:
         """As of merging: ``half`` with half of the Gaussians, without end with all."""
@@ -155,7 +176,11 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
 
     found = {
         half: largest_within(
-            full, lambda count: full[:count], limit, lambda share: None, functools.partial(psnr_of, half)
+            full,
+            lambda count: full[:count],
+            limit,
+            lambda share: None,
+            functools.partial(psnr_of, half),
         )
         for half in (25.0, 35.0)
     }
@@ -177,7 +202,9 @@ def test_the_psnr_of_rounding_falls_by_the_slope_at_any_share(kept):
 
 
 def test_a_scene_is_rounded_as_far_as_its_size_needs():
-    scene, kind, usual = cloud(2000), format_to_write(".spz"), 0.002
+    scene = cloud(2000)
+    kind = format_to_write(".spz")
+    usual = 0.002
     size = FileLimit(kind, 10**9).bytes_of(kind.rounded(scene, usual))
     for most in (int(0.9 * size), size, int(1.05 * size)):
         found = FileLimit(kind, most, usual).bytes_of(FileLimit(kind, most, usual).rounded(scene))
@@ -187,8 +214,11 @@ def test_a_scene_is_rounded_as_far_as_its_size_needs():
 
 
 def test_all_are_kept_unrounded_if_all_fit():
-    full, limit = cloud(500), FileLimit(format_to_write(".sog"), 10**6)
-    scene, unrounded, _ = largest_within(full, lambda count: full[:count], limit, lambda share: None)
+    full = cloud(500)
+    limit = FileLimit(format_to_write(".sog"), 10**6)
+    scene, unrounded, _ = largest_within(
+        full, lambda count: full[:count], limit, lambda share: None
+    )
     assert scene is full and unrounded.rounded(full) is full
     larger = cloud(1000, seed=1)  # as a repair may make one
     tight = FileLimit(limit.kind, limit.bytes_of(larger) * 4 // 5)

@@ -59,7 +59,8 @@ def test_steps_that_are_not_learned_are_those_of_adam(scene, settings):
 
 
 def test_factors_reach_their_parameters_and_what_no_view_shows_stays(scene):
-    feedback, given = Feedback(scene, 1000), gradients(scene, 0)
+    feedback = Feedback(scene, 1000)
+    given = gradients(scene, 0)
     for value in given.values():
         value[3] = 0.0
     feedback.observe(given)
@@ -76,7 +77,8 @@ def test_factors_reach_their_parameters_and_what_no_view_shows_stays(scene):
 
 def test_factors_in_pieces_are_those_of_the_whole(scene):
     many = scene[torch.arange(5000) % len(scene)]
-    feedback, network = Feedback(many, 9000), shipped_feedback_refiner(torch.device("cpu"))
+    feedback = Feedback(many, 9000)
+    network = shipped_feedback_refiner(torch.device("cpu"))
     feedback.observe(gradients(many, 0))
     expected = network(feedback.features(many, 0.5, 8))
     torch.testing.assert_close(feedback.factors(network, many, 0.5, 8), expected, rtol=1e-5, atol=0)
@@ -88,12 +90,17 @@ def test_factors_in_pieces_are_those_of_the_whole(scene):
 def test_a_step_in_one_pass_is_one_after_the_other(scene, size, degree, weighed):
     rest = torch.zeros(len(scene), (degree + 1) ** 2 - 1, 3)
     many = scene.replace(features_rest=rest)[torch.arange(2500) % len(scene)]
-    many.opacities[0], many.opacities[1], many.scales[2, 0] = math.inf, -math.inf, -math.inf
+    many.opacities[0] = math.inf
+    many.opacities[1] = -math.inf
+    many.scales[2, 0] = -math.inf
     many = many.replace(features_rest=many.features_rest.mT.contiguous().mT)  # other strides
-    factors = torch.rand(len(many), 6, generator=torch.Generator().manual_seed(2)) if weighed else None
+    factors = (
+        torch.rand(len(many), 6, generator=torch.Generator().manual_seed(2)) if weighed else None
+    )
 
     def after(dtype, at_once):
-        now, adam = many.to(dtype), Adam(many.to(dtype), AdamSettings(faster=4.0, damping=0.01))
+        now = many.to(dtype)
+        adam = Adam(many.to(dtype), AdamSettings(faster=4.0, damping=0.01))
         for seed in range(3):
             if at_once:
                 now = adam.stepped(now, gradients(now, seed, size), lambda _: (0.5, factors))
@@ -102,7 +109,9 @@ def test_a_step_in_one_pass_is_one_after_the_other(scene, size, degree, weighed)
                 now = adam.moved(now, 0.5, factors)
         return [*now.tensors(), *adam.state().values()]
 
-    ours, torchs, exact = after(torch.float32, True), after(torch.float32, False), after(torch.float64, True)
+    ours = after(torch.float32, True)
+    torchs = after(torch.float32, False)
+    exact = after(torch.float64, True)
     for mine, theirs, right in zip(ours, torchs, exact, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-7)
         if size != 1e-30:  # its square is 0 in float32
@@ -113,7 +122,11 @@ def test_a_step_is_the_same_on_any_threads(scene):
     many = scene[torch.arange(9000) % len(scene)]
 
     def step():
-        return Adam(many, AdamSettings()).stepped(many, gradients(many, 1), lambda _: (1.0, None)).tensors()
+        return (
+            Adam(many, AdamSettings())
+            .stepped(many, gradients(many, 1), lambda _: (1.0, None))
+            .tensors()
+        )
 
     assert_same_on_any_threads(step)
 
@@ -122,8 +135,13 @@ def test_a_step_is_the_same_on_any_threads(scene):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_features_and_steps_are_right_at_the_extremes(scene, size, degree):
     rest = torch.zeros(len(scene), (degree + 1) ** 2 - 1, 3)
-    wild = scene.replace(features_rest=rest, opacities=scene.opacities.clone(), scales=scene.scales.clone())
-    wild.opacities[0], wild.opacities[1], wild.scales[2, 0], wild.scales[3] = math.inf, -math.inf, -math.inf, 80.0
+    wild = scene.replace(
+        features_rest=rest, opacities=scene.opacities.clone(), scales=scene.scales.clone()
+    )
+    wild.opacities[0] = math.inf
+    wild.opacities[1] = -math.inf
+    wild.scales[2, 0] = -math.inf
+    wild.scales[3] = 80.0
     found = []
     for dtype in (torch.float32, torch.float64):
         feedback = Feedback(wild.to(dtype), 1000)
@@ -131,11 +149,16 @@ def test_features_and_steps_are_right_at_the_extremes(scene, size, degree):
             feedback.observe(gradients(wild.to(dtype), seed, size))
         features = feedback.features(wild.to(dtype), 1.0, 10**6)
         moves = feedback.moves(1.0)
-        assert features.shape == (len(scene), FeedbackRefiner.FEATURES) and features.dtype == torch.float32
+        assert (
+            features.shape == (len(scene), FeedbackRefiner.FEATURES)
+            and features.dtype == torch.float32
+        )
         assert bool(features.isfinite().all()) and float(features.abs().max()) <= 8
         assert all(bool(value.isfinite().all()) for value in moves.values())
         found.append((features, moves))
     if 1e-18 < size or size == 0:  # squares of smaller gradients are 0 in float32
         torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-3, atol=1e-3)
         for name in PARAMETERS:
-            torch.testing.assert_close(found[0][1][name].double(), found[1][1][name], rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(
+                found[0][1][name].double(), found[1][1][name], rtol=1e-4, atol=1e-6
+            )

@@ -1,4 +1,5 @@
-"""Training a smaller scene on photos: what it gains where no step looked, which pixels count, and how it ends."""
+"""Training a smaller scene on photos: what it gains where no step looked, which pixels count, and
+how it ends."""
 
 import dataclasses
 import math
@@ -13,7 +14,15 @@ from pointsplat_ns.compression import compact as compacting
 from pointsplat_ns.compression import photo_repair as module
 from pointsplat_ns.compression import requests
 from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
-from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, extent, gradients_of, size_factors
+from pointsplat_ns.compression.optimiser import (
+    RATES,
+    Adam,
+    AdamSettings,
+    Example,
+    extent,
+    gradients_of,
+    size_factors,
+)
 from pointsplat_ns.compression.photo_repair import photo_repair, reallocated, split
 from pointsplat_ns.compression.quality import through_file
 from pointsplat_ns.compression.requests import (
@@ -55,11 +64,15 @@ def photos(hollow_ball):
     return [Example(view, render(photographed, view).detach()) for view in views]
 
 
-def test_unseen_photos_are_in_no_step_and_the_others_in_turn(hollow_ball, pruned, photos, monkeypatch):
+def test_unseen_photos_are_in_no_step_and_the_others_in_turn(
+    hollow_ball, pruned, photos, monkeypatch
+):
     taken = []
     for place in (module, examples):
         monkeypatch.setattr(
-            place, "every_kth_pixel", lambda photo, *rest: taken.append(id(photo)) or every_kth_pixel(photo, *rest)
+            place,
+            "every_kth_pixel",
+            lambda photo, *rest: taken.append(id(photo)) or every_kth_pixel(photo, *rest),
         )
     photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"))
     unseen = [id(photo) for photo in photos[::8]]
@@ -80,16 +93,28 @@ def test_unseen_photos_are_in_no_step_and_the_others_in_turn(hollow_ball, pruned
 def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
     faster, unseen, most_lost, stages, text, hollow_ball, monkeypatch
 ):
-    """Steps that are far too long harm; photos in which colours go the other way lose, and a repair follows."""
-    settings = dataclasses.replace(module.PHOTO_REPAIR, adam=AdamSettings(faster), most_lost=most_lost)
+    """Steps that are far too long harm; photos in which colours go the other way lose, and a repair
+    follows."""
+    settings = dataclasses.replace(
+        module.PHOTO_REPAIR, adam=AdamSettings(faster), most_lost=most_lost
+    )
     for place in (module, compacting):
         monkeypatch.setattr(place, "PHOTO_REPAIR", settings)
-    scenes = [hollow_ball.replace(features_dc=hollow_ball.features_dc + change) for change in (unseen, 0.4)]
+    scenes = [
+        hollow_ball.replace(features_dc=hollow_ball.features_dc + change)
+        for change in (unseen, 0.4)
+    ]
     views = views_from_within((5.0, 0.0, 0.0), 18, 48, 36)
-    photos = [Example(view, render(scenes[index % 8 > 0], view).detach()) for index, view in enumerate(views)]
-    request = CompactRequest(PruneRequest(300), repair=RepairBudget("quick"), photos=PhotoBudget("quick"))
+    photos = [
+        Example(view, render(scenes[index % 8 > 0], view).detach())
+        for index, view in enumerate(views)
+    ]
+    request = CompactRequest(
+        PruneRequest(300), repair=RepairBudget("quick"), photos=PhotoBudget("quick")
+    )
     result = compact_scene(hollow_ball, request, FewViews(hollow_ball), photos=photos)
-    stage, kept = result.stages[-1], text.startswith("trained")
+    stage = result.stages[-1]
+    kept = text.startswith("trained")
     assert [stage.name for stage in result.stages[1:]] == stages
     assert stage.accepted == kept and text in result.verdict.splitlines()[-1]
     assert (result.scene is stage.scene) == kept
@@ -97,31 +122,52 @@ def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
     assert stage.photos.before == stage.photos.beside(result.stages[-2].scene, photos).before
 
 
-@pytest.mark.parametrize(("large", "side", "stages"), [(299, 320, ["repair", "photos"]), (300, 160, ["photos"])])
+@pytest.mark.parametrize(
+    ("large", "side", "stages"), [(299, 320, ["repair", "photos"]), (300, 160, ["photos"])]
+)
 def test_a_large_scene_is_repaired_first_and_more_pixels_are_drawn(
     large, side, stages, hollow_ball, photos, monkeypatch
 ):
-    settings, sides = dataclasses.replace(module.PHOTO_REPAIR, large=large), set()
+    settings = dataclasses.replace(module.PHOTO_REPAIR, large=large)
+    sides = set()
     for place in (module, compacting):
         monkeypatch.setattr(place, "PHOTO_REPAIR", settings)
     monkeypatch.setattr(
-        module, "every_kth_pixel", lambda photo, side, *rest: sides.add(side) or every_kth_pixel(photo, side, *rest)
+        module,
+        "every_kth_pixel",
+        lambda photo, side, *rest: sides.add(side) or every_kth_pixel(photo, side, *rest),
     )
     monkeypatch.setattr(requests, "FEW", 75)
-    request = CompactRequest(PruneRequest(300), repair=RepairBudget("quick"), photos=PhotoBudget("quick"))
+    request = CompactRequest(
+        PruneRequest(300), repair=RepairBudget("quick"), photos=PhotoBudget("quick")
+    )
     result = compact_scene(hollow_ball, request, FewViews(hollow_ball), photos=photos)
     last = result.stages[-1]
-    assert [stage.name for stage in result.stages[1:]] == stages and last.accepted and sides == {side}
+    assert (
+        [stage.name for stage in result.stages[1:]] == stages and last.accepted and sides == {side}
+    )
     assert last.photos is not None
-    assert last.photos.before == mean_psnr(result.stages[-2].scene, photos, module._roles(len(photos))[1])
+    assert last.photos.before == mean_psnr(
+        result.stages[-2].scene, photos, module._roles(len(photos))[1]
+    )
 
 
 def test_auto_finds_the_smallest_file_that_loses_little_in_held_out_photos(hollow_ball, photos):
-    request = CompactRequest.of(keep="auto", photos=True, suffix=".sog", repair=RepairBudget("quick"))
-    request = dataclasses.replace(request, most_lost=-2.0, repair=RepairBudget("instant"))  # gains 2 dB by the photos
-    training, held_out = photos[1:], photos[::8]
-    found = compact_to_psnr(hollow_ball, request, FewViews(hollow_ball), photos=training, held_out=held_out)
-    before, after = (mean_psnr(s, held_out, [0, 1, 2]) for s in (hollow_ball, through_file(found.scene, ".sog")[1]))
+    request = CompactRequest.of(
+        keep="auto", photos=True, suffix=".sog", repair=RepairBudget("quick")
+    )
+    request = dataclasses.replace(
+        request, most_lost=-2.0, repair=RepairBudget("instant")
+    )  # gains 2 dB by the photos
+    training = photos[1:]
+    held_out = photos[::8]
+    found = compact_to_psnr(
+        hollow_ball, request, FewViews(hollow_ball), photos=training, held_out=held_out
+    )
+    before, after = (
+        mean_psnr(s, held_out, [0, 1, 2])
+        for s in (hollow_ball, through_file(found.scene, ".sog")[1])
+    )
     assert 2.0 <= after - before < 3.0 and len(found.scene) < 0.7 * len(hollow_ball)
     assert "in 3 held-out photos, the dense scene" in found.target and "sizes tried" in found.target
     with pytest.raises(DataError, match="there are no held-out photos"):
@@ -135,10 +181,14 @@ def test_ctrl_c_gives_the_scene_so_far(hollow_ball, pruned, photos):
         if share > 0.6:
             raise KeyboardInterrupt
 
-    trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"), stop)
+    trained = photo_repair(
+        pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"), stop
+    )
     assert trained.interrupted and trained.steps == 25 and trained.after > trained.before + 0.5
     assert (trained.used, trained.compared, len(trained.scene)) == (15, 12, 300)
-    assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), "the input was changed"
+    assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), (
+        "the input was changed"
+    )
 
 
 def test_one_photo_is_too_few(hollow_ball, pruned, photos):
@@ -154,14 +204,24 @@ def test_gaussians_move_by_a_share_of_their_own_size(hollow_ball, pruned, photos
     middle = pruned.scales.exp().median(dim=1).values
     seen = moves.amax(1) > 0
     assert int(seen.sum()) > 50
-    assert torch.allclose(moves.amax(1)[seen], 0.25 * middle[seen], rtol=1e-4)  # Adam's first step has length 1
+    assert torch.allclose(
+        moves.amax(1)[seen], 0.25 * middle[seen], rtol=1e-4
+    )  # Adam's first step has length 1
 
 
 def test_sizes_at_their_extremes_move_nothing_to_infinity(pruned):
-    logs = [(-math.inf, -math.inf, -2.0), (-200.0, -150.0, 0.0), (-1e-3, 0.0, 88.0), (300.0, 200.0, 100.0)]
+    logs = [
+        (-math.inf, -math.inf, -2.0),
+        (-200.0, -150.0, 0.0),
+        (-1e-3, 0.0, 88.0),
+        (300.0, 200.0, 100.0),
+    ]
     scales = torch.tensor([*logs, (math.inf,) * 3, (math.nan,) * 3])
     scene = pruned[: len(scales)].replace(scales=scales)
-    shares = [size_factors(scene.map(lambda value, to=to: value.to(to)), 4.0) for to in (torch.float32, torch.float64)]
+    shares = [
+        size_factors(scene.map(lambda value, to=to: value.to(to)), 4.0)
+        for to in (torch.float32, torch.float64)
+    ]
     assert shares[0][:, 1:].eq(1).all()
     assert torch.allclose(shares[0].double(), shares[1], rtol=1e-5, atol=1e-30)
     assert shares[1][:, 0].tolist() == pytest.approx([0.0, math.exp(-150) / 4, 0.25, 1.0, 1.0, 0.0])
@@ -173,7 +233,11 @@ def test_every_kth_pixel_of_a_photo_is_what_its_view_draws(hollow_ball, generato
     whole = Example(view, render(hollow_ball, view).detach(), torch.rand(120, 159, 1) < 0.5)
     part = every_kth_pixel(whole, 53, CPU, generator)
     assert (part.view.width, part.view.height, part.view.eps2d) == (53, 40, EPS2D / 9)
-    assert part.target.shape == (40, 53, 3) and part.mask is not None and part.mask.shape == (40, 53, 1)
+    assert (
+        part.target.shape == (40, 53, 3)
+        and part.mask is not None
+        and part.mask.shape == (40, 53, 1)
+    )
     # 3DGS bounds the projection at 1.3 times the picture, whose middle moves a little.
     assert float((render(hollow_ball, part.view) - part.target).abs().mean()) < 2e-4
     assert float(part.target.std()) > 0.05
@@ -183,7 +247,10 @@ def test_every_kth_pixel_of_a_photo_is_what_its_view_draws(hollow_ball, generato
 def test_masked_pixels_neither_pull_nor_count(hollow_ball, pruned, photos):
     mask = torch.zeros(36, 48, 1, dtype=torch.bool)
     mask[:, :24] = True
-    wrong = [photo._replace(target=torch.where(mask, photo.target, 1 - photo.target), mask=mask) for photo in photos]
+    wrong = [
+        photo._replace(target=torch.where(mask, photo.target, 1 - photo.target), mask=mask)
+        for photo in photos
+    ]
     right = [photo._replace(mask=mask) for photo in photos]
     first, second = (gradients_of(pruned, *some[1]) for some in (wrong, right))
     assert all(torch.equal(first[name], second[name]) for name in first)
@@ -198,7 +265,9 @@ def test_a_run_is_compacted_with_its_photos(trained_walls):
 
 
 def test_halves_lie_on_both_sides_along_the_longest_axis(hollow_ball):
-    scene = hollow_ball[:5].replace(scales=torch.tensor([[-3.0, -1.0, -2.0]] * 4 + [[-math.inf, -4.0, 0.0]]))
+    scene = hollow_ball[:5].replace(
+        scales=torch.tensor([[-3.0, -1.0, -2.0]] * 4 + [[-math.inf, -4.0, 0.0]])
+    )
     halves = split(scene, torch.tensor([4, 1]))
     assert len(halves) == 7
     for name, value in scene.items():
@@ -207,11 +276,14 @@ def test_halves_lie_on_both_sides_along_the_longest_axis(hollow_ball):
             assert torch.equal(dict(halves.items())[name][3:], value[[4, 1, 4, 1]]), name
     matrices = rotation_matrices(scene.quats)
     for whole, axis in ((4, 2), (1, 1)):
-        first, second = (3 + (whole == 1), 5 + (whole == 1))
+        first = 3 + (whole == 1)
+        second = 5 + (whole == 1)
         apart = (halves.means[first] - halves.means[second]) / 2
         size = scene.scales[whole, axis].exp()
         assert torch.allclose(apart, 0.5 * size * matrices[whole, :, axis], atol=1e-6)
-        assert torch.allclose((halves.means[first] + halves.means[second]) / 2, scene.means[whole], atol=1e-6)
+        assert torch.allclose(
+            (halves.means[first] + halves.means[second]) / 2, scene.means[whole], atol=1e-6
+        )
         change = halves.scales[first] - scene.scales[whole]
         assert float(change[axis]) == pytest.approx(math.log(math.sqrt(1 - 0.5**2)), abs=1e-6)
         assert torch.equal(halves.scales[first], halves.scales[second])

@@ -28,15 +28,24 @@ def views(scene) -> Views:
 
 
 def pruned(
-    scene: Gaussians, views: Views | ViewSource | None, keep: Keep | str, by: str = "merge", progress=silent, **options
+    scene: Gaussians,
+    views: Views | ViewSource | None,
+    keep: Keep | str,
+    by: str = "merge",
+    progress=silent,
+    **options,
 ) -> Pruned:
     """Pruned with renders compared in the given views."""
     source = ViewSource(scene, given=views) if isinstance(views, Views) else views
     return prune_scene(scene, PruneRequest(keep, by, **options), source, progress)
 
 
-@pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if method.needs_views))
-def test_a_score_that_looks_at_the_scene_is_computed_once_and_chooses(by, scene, views, monkeypatch):
+@pytest.mark.parametrize(
+    "by", sorted(name for name, method in METHODS.items() if method.needs_views)
+)
+def test_a_score_that_looks_at_the_scene_is_computed_once_and_chooses(
+    by, scene, views, monkeypatch
+):
     calls = []
     method = METHODS[by]
 
@@ -51,7 +60,10 @@ def test_a_score_that_looks_at_the_scene_is_computed_once_and_chooses(by, scene,
 
 
 def test_a_psnr_in_a_format_is_reached_by_its_rounded_scene(scene, views):
-    plain, small = (pruned(scene, views, WithinPsnr(22.0, suffix), "coverage").scene for suffix in (".ply", ".spz"))
+    plain, small = (
+        pruned(scene, views, WithinPsnr(22.0, suffix), "coverage").scene
+        for suffix in (".ply", ".spz")
+    )
     assert len(encode_spz(small)) < len(encode_spz(plain))
     assert DenseReference(scene, views).psnr(small)[0] >= 22.0
 

@@ -9,7 +9,14 @@ import pytest
 from making import box_room
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.comparing.fill import fill
-from pointsplat_ns.compression.quality import Judge, PhotoGain, Quality, judge_of, quality_of_file, through_file
+from pointsplat_ns.compression.quality import (
+    Judge,
+    PhotoGain,
+    Quality,
+    judge_of,
+    quality_of_file,
+    through_file,
+)
 from pointsplat_ns.io import save
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.view_source import ViewSource
@@ -23,18 +30,26 @@ def dense():
 
 
 def test_the_figures_are_those_of_whole_pictures_over_covered_pixels(dense):
-    small, views = dense[::3], sample_views(dense, 3, 64, 48)
-    found, whole = Judge(dense, ViewSource(dense, views)).quality(small), DenseReference(dense, views)
+    small = dense[::3]
+    views = sample_views(dense, 3, 64, 48)
+    found = Judge(dense, ViewSource(dense, views)).quality(small)
+    whole = DenseReference(dense, views)
     assert (found.psnr, found.worst) == whole.psnr(small)
-    assert found.ssim == pytest.approx(1 - (1 - whole.ssim(small)) / (sum(whole.covered) / 3), abs=1e-6)
+    assert found.ssim == pytest.approx(
+        1 - (1 - whole.ssim(small)) / (sum(whole.covered) / 3), abs=1e-6
+    )
     assert (found.fill_before, found.fill) == (fill(dense, views), fill(small, views))
 
 
 def test_few_pixels_of_large_pictures_stand_for_all(dense):
-    small, views = dense[::3], sample_views(dense, 4, 960, 720)
-    found, whole = Judge(dense, ViewSource(dense, views)).quality(small), DenseReference(dense, views)
+    small = dense[::3]
+    views = sample_views(dense, 4, 960, 720)
+    found = Judge(dense, ViewSource(dense, views)).quality(small)
+    whole = DenseReference(dense, views)
     assert found.psnr == pytest.approx(whole.psnr(small)[0], abs=0.1)
-    assert found.ssim == pytest.approx(1 - (1 - whole.ssim(small)) / (sum(whole.covered) / 4), abs=0.05)
+    assert found.ssim == pytest.approx(
+        1 - (1 - whole.ssim(small)) / (sum(whole.covered) / 4), abs=0.05
+    )
     assert (found.views, found.width, found.height) == (4, 960, 720)
 
 
@@ -64,10 +79,13 @@ def test_one_line_says_how_good_a_scene_is(psnr, line):
 
 def test_photos_lead_where_they_were_trained_on():
     trained = replace(SOME, photos=PhotoGain(19.24, 26.1, 12, kept=True))
-    assert str(trained) == ("19.2 -> 26.1 dB in 12 training photos; 28.8 dB, SSIM 0.91 against the dense scene")
+    assert str(trained) == (
+        "19.2 -> 26.1 dB in 12 training photos; 28.8 dB, SSIM 0.91 against the dense scene"
+    )
     left_out = replace(SOME, photos=PhotoGain(19.24, 19.1, 12, kept=False))
     assert str(left_out) == (
-        "19.2 dB in 12 photos, which training on them does not raise; 28.8 dB, SSIM 0.91: edges of small things blur"
+        "19.2 dB in 12 photos, which training on them does not raise; 28.8 dB, SSIM 0.91: edges "
+        "of small things blur"
     )
 
 

@@ -13,7 +13,13 @@ import pointsplat_ns.compression.requests as requests
 from making import FewViews, ball, same
 from pointsplat_ns.api import example_room
 from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
+from pointsplat_ns.compression.optimiser import (
+    Adam,
+    AdamSettings,
+    gradients_of,
+    nonzero_rms,
+    optimised,
+)
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.compression.unfinished import Unfinished
 from pointsplat_ns.errors import PointSplatError
@@ -47,17 +53,28 @@ def pruned(hollow_ball):
 def test_repair_comes_closer_in_views_that_it_has_not_seen(hollow_ball, pruned, ball_views):
     before = [value.clone() for value in pruned.tensors()]
     shares = []
-    repaired = repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("quick"), shares.append, network=None)
+    repaired = repair(
+        pruned,
+        hollow_ball,
+        FewViews(hollow_ball),
+        RepairBudget("quick"),
+        shares.append,
+        network=None,
+    )
     reference = DenseReference(hollow_ball, ball_views)
     assert reference.psnr(repaired.scene)[0] > reference.psnr(pruned)[0] + 1
     assert len(repaired.scene) == 300 and bool(repaired.scene.usable().all())
     assert not any(value.requires_grad for value in repaired.scene.tensors())
-    assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), "the input was changed"
+    assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), (
+        "the input was changed"
+    )
     assert repaired.steps == STEPS["quick"] and not repaired.interrupted and repaired.seconds > 0
     assert shares == pytest.approx([(i + 1) / STEPS["quick"] for i in range(STEPS["quick"])])
 
 
-def test_repairs_of_many_gaussians_take_more_steps_views_and_pixels_at_lower_rates(hollow_ball, pruned, monkeypatch):
+def test_repairs_of_many_gaussians_take_more_steps_views_and_pixels_at_lower_rates(
+    hollow_ball, pruned, monkeypatch
+):
     monkeypatch.setitem(STEPS, "quick", 4)
     monkeypatch.setattr(requests, "FEW", 75)
     asked = []
@@ -67,11 +84,17 @@ def test_repairs_of_many_gaussians_take_more_steps_views_and_pixels_at_lower_rat
             asked.append((count, drawn_side))
             return self.sampled(seed)
 
-    repaired = repair(pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None)
+    repaired = repair(
+        pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None
+    )
     assert repaired.steps == 8 and asked == [(2 * VIEW_COUNTS.stepped, 453)]
     monkeypatch.setattr(requests, "FEW", 1e-9)
-    still = repair(pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None).scene
-    assert torch.allclose(still.means, pruned.means, atol=1e-6), "of very many, each moves very little"
+    still = repair(
+        pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None
+    ).scene
+    assert torch.allclose(still.means, pruned.means, atol=1e-6), (
+        "of very many, each moves very little"
+    )
 
 
 def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
@@ -83,9 +106,14 @@ def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
         reference = DenseReference(room, sample_views(room, 4, 160, 120, seed=99))
         source = ViewSource(room, given=sample_views(room, 20, 160, 120, seed=98))
     learned, plain = (
-        repair(pruned, room, source, RepairBudget("quick"), network=network).scene for network in ("shipped", None)
+        repair(pruned, room, source, RepairBudget("quick"), network=network).scene
+        for network in ("shipped", None)
     )
-    assert reference.psnr(learned)[0] > reference.psnr(plain)[0] + 0.05 > reference.psnr(pruned)[0] + 0.1
+    assert (
+        reference.psnr(learned)[0]
+        > reference.psnr(plain)[0] + 0.05
+        > reference.psnr(pruned)[0] + 0.1
+    )
 
 
 def test_no_effort_takes_no_step_and_a_time_takes_that_long(hollow_ball, pruned, monkeypatch):
@@ -95,7 +123,9 @@ def test_no_effort_takes_no_step_and_a_time_takes_that_long(hollow_ball, pruned,
         assert repaired.steps == 0 and same(repaired.scene, pruned)
     clock = itertools.count()  # a second each time that anybody looks
     monkeypatch.setattr(repair_module.time, "perf_counter", lambda: float(next(clock)))
-    assert repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("thorough", 7.0)).steps == 7
+    assert (
+        repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("thorough", 7.0)).steps == 7
+    )
 
 
 def test_an_interruption_loses_nothing(hollow_ball, pruned):
@@ -116,7 +146,14 @@ def test_a_killed_repair_continues_to_the_same_bits(hollow_ball, pruned, tmp_pat
         done = []
         try:
             report = lambda share: done.append(share) or (share > killed_at and sys.exit())  # noqa: E731
-            last = repair(start, hollow_ball, FewViews(hollow_ball), RepairBudget("quick"), report, unfinished=file)
+            last = repair(
+                start,
+                hollow_ball,
+                FewViews(hollow_ball),
+                RepairBudget("quick"),
+                report,
+                unfinished=file,
+            )
         except SystemExit:
             return None, done
         return last.scene, done
@@ -126,14 +163,20 @@ def test_a_killed_repair_continues_to_the_same_bits(hollow_ball, pruned, tmp_pat
     assert repaired(0.32)[0] is None and repaired(0.64)[1][0] == 11 / 32  # killed after 11 and 21
     rest, done = repaired()
     assert same(rest, whole) and done[0] == 21 / 32
-    assert len(repaired(start=pruned.replace(means=pruned.means + 0.1))[1]) == 32, "another scene starts anew"
+    assert len(repaired(start=pruned.replace(means=pruned.means + 0.1))[1]) == 32, (
+        "another scene starts anew"
+    )
     file.write_bytes(file.read_bytes()[:-9])
     assert len(repaired()[1]) == 32, "so does a damaged file"
 
 
-@pytest.mark.parametrize("budget", [("slow",), ("quick", -1.0), ("quick", math.nan), ("quick", math.inf)])
+@pytest.mark.parametrize(
+    "budget", [("slow",), ("quick", -1.0), ("quick", math.nan), ("quick", math.inf)]
+)
 def test_a_budget_that_means_nothing_is_refused(budget):
-    with pytest.raises(PointSplatError, match="is 'slow'; expected one of instant, quick, th|the time to repair is"):
+    with pytest.raises(
+        PointSplatError, match="is 'slow'; expected one of instant, quick, th|the time to repair is"
+    ):
         RepairBudget(*budget)
 
 
@@ -141,9 +184,14 @@ def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
     many = sample_views(hollow_ball, 40, 48, 36)
     source = ViewSource(hollow_ball, given=many)
     compared = {place(m) for m in source.compared().viewmats}
-    first, second = ([place(view.viewmat) for view in itertools.islice(source.others(seed), 56)] for seed in (0, 1))
+    first, second = (
+        [place(view.viewmat) for view in itertools.islice(source.others(seed), 56)]
+        for seed in (0, 1)
+    )
     assert len(compared) == VIEW_COUNTS.compared and not compared & set(first)
-    assert len(set(first[:28])) == 28 and set(first[:28]) == set(first[28:]), "each once before any is repeated"
+    assert len(set(first[:28])) == 28 and set(first[:28]) == set(first[28:]), (
+        "each once before any is repeated"
+    )
     assert first != second
 
 
@@ -169,9 +217,12 @@ def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_that_are_not_finite_and_values_that_are_not_stay_out(pruned, ball_views, dtype, monkeypatch):
+def test_gradients_that_are_not_finite_and_values_that_are_not_stay_out(
+    pruned, ball_views, dtype, monkeypatch
+):
     scene = pruned.map(torch.clone).to(dtype)
-    scene.opacities[0], scene.scales[1, 2] = math.inf, -math.inf
+    scene.opacities[0] = math.inf
+    scene.scales[1, 2] = -math.inf
 
     def spoiled(scene, view, **options):
         weight = torch.ones_like(scene.means)
@@ -190,10 +241,16 @@ def test_gradients_that_are_not_finite_and_values_that_are_not_stay_out(pruned, 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("together", [1, 2, 3])
 def test_steps_take_gradients_of_one_scene_together(pruned, ball_views, together, threads):
-    examples = [Example(view, torch.full((48, 64, 3), 0.1 * i)) for i, view in enumerate(ball_views[:6])]
-    adam, scene, wanted = Adam(pruned, AdamSettings()), pruned, []
+    examples = [
+        Example(view, torch.full((48, 64, 3), 0.1 * i)) for i, view in enumerate(ball_views[:6])
+    ]
+    adam = Adam(pruned, AdamSettings())
+    scene = pruned
+    wanted = []
     for first in range(0, 6, together):
-        gradients = [gradients_of(scene, *example) for example in examples[first : first + together]]
+        gradients = [
+            gradients_of(scene, *example) for example in examples[first : first + together]
+        ]
         for each in gradients:
             scene = adam.stepped(scene, each, lambda scene: (1.0, None))
             wanted.append(scene)

@@ -31,7 +31,9 @@ def views(dense) -> ps.Views:
 @pytest.fixture(autouse=True)
 def few_views(views, monkeypatch):
     """Three small views of any scene."""
-    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count])
+    monkeypatch.setattr(
+        view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count]
+    )
 
 
 def mean_psnr(scene, dense, views) -> float:
@@ -47,14 +49,17 @@ def test_the_file_that_is_written_has_the_quality_and_few_gaussians(dense, views
     said = quality_of_file(found.judge, found.scene, path)
     assert said.psnr >= 25
     reached = f"{decibels(said.psnr)} against the dense scene in 3 views of 48 x 36 pixels"
-    assert found.target.startswith(f"{reached}, {bytes_text(path.stat().st_size)}, {len(found.scene):,} Gaussians; ")
+    assert found.target.startswith(
+        f"{reached}, {bytes_text(path.stat().st_size)}, {len(found.scene):,} Gaussians; "
+    )
     assert (found.stages[-1].name == "round") == (suffix != ".ply")
     fewer = ps.compact(dense, round(0.85 * len(found.scene)), by="opacity")  # which is not rounded
     assert Judge(dense, ViewSource(dense)).psnr(through_file(fewer.scene, suffix)[1])[0] < 25
 
 
 def test_each_count_is_repaired_and_has_the_sh_bands_that_are_asked_for(dense, monkeypatch):
-    grey, repaired = dense.replace(features_rest=0.01 * dense.features_rest), []
+    grey = dense.replace(features_rest=0.01 * dense.features_rest)
+    repaired = []
 
     def repair(scene, dense, views, budget, *_, **others) -> Repaired:
         repaired.append((len(scene), budget.effort))
@@ -68,7 +73,8 @@ def test_each_count_is_repaired_and_has_the_sh_bands_that_are_asked_for(dense, m
 
 @pytest.mark.parametrize("found", [True, False])
 def test_ctrl_c_gives_the_smallest_scene_so_far_if_any_reaches_it(dense, monkeypatch, found):
-    made, original = [], compact.compact_scene
+    made = []
+    original = compact.compact_scene
 
     def interrupted(*args):
         if len(made) == (3 if found else 0):
@@ -83,7 +89,11 @@ def test_ctrl_c_gives_the_smallest_scene_so_far_if_any_reaches_it(dense, monkeyp
         return
     result = ps.compact(dense, by="opacity", target_db=20.0)
     reaching = [len(some.scene) for some in made if some.psnr >= 20]
-    assert result.interrupted and result.target.endswith("interrupted") and len(result.scene) == min(reaching)
+    assert (
+        result.interrupted
+        and result.target.endswith("interrupted")
+        and len(result.scene) == min(reaching)
+    )
 
 
 @pytest.mark.parametrize(

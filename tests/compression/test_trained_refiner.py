@@ -34,7 +34,13 @@ def test_a_file_of_weights_says_what_it_was_trained_with(metadata, settings, tmp
 
 @pytest.mark.parametrize(
     "metadata",
-    [{"keep": 1.5}, {"keep": 10**400}, {"by": "best"}, {"opacity_weight": []}, {"opacity_weight": -(10**400)}],
+    [
+        {"keep": 1.5},
+        {"keep": 10**400},
+        {"by": "best"},
+        {"opacity_weight": []},
+        {"opacity_weight": -(10**400)},
+    ],
 )
 def test_metadata_that_make_no_sense_are_refused_in_one_line(metadata, tmp_path):
     save_refiner(small_refiner(), tmp_path / "r.safetensors", metadata)
@@ -45,7 +51,9 @@ def test_metadata_that_make_no_sense_are_refused_in_one_line(metadata, tmp_path)
 
 def test_anything_else_is_no_refiner(tmp_path):
     (tmp_path / "scene.ply").touch()
-    with pytest.raises(WeightsError, match="scene.ply: a .ply file; expected a trained pointsplat run"):
+    with pytest.raises(
+        WeightsError, match="scene.ply: a .ply file; expected a trained pointsplat run"
+    ):
         load_refiner(tmp_path / "scene.ply")
     with pytest.raises(SceneError, match="no such file"):
         load_refiner(tmp_path / "gone")
@@ -53,27 +61,42 @@ def test_anything_else_is_no_refiner(tmp_path):
         load_refiner(tmp_path / "gone.safetensors")
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "config.yml").touch()  # of a run in the same folder
-    with pytest.raises(WeightsError, match="pipe: not a regular file; expected a trained pointsplat run"):
+    with pytest.raises(
+        WeightsError, match="pipe: not a regular file; expected a trained pointsplat run"
+    ):
         load_refiner(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_a_scene_of_any_size_and_degree_is_pruned_and_refined(make_refined_run, trained_walls, tmp_path, degree):
-    loaded = load_refiner(make_refined_run(tmp_path, trained_walls, moved=0.25, keep=0.4, by="opacity"))
+def test_a_scene_of_any_size_and_degree_is_pruned_and_refined(
+    make_refined_run, trained_walls, tmp_path, degree
+):
+    loaded = load_refiner(
+        make_refined_run(tmp_path, trained_walls, moved=0.25, keep=0.4, by="opacity")
+    )
     assert loaded.settings == PruneSettings(0.4, "opacity")
     dense = normal_scene(60, degree, seed=7)
     small = loaded(loaded.settings.prune(dense))
     pruned = prune(dense, 0.4, "opacity")
     assert len(small) == 24 and small.sh_degree == degree
-    assert torch.equal(small.opacities, pruned.opacities + 0.25) and torch.equal(small.means, pruned.means)
+    assert torch.equal(small.opacities, pruned.opacities + 0.25) and torch.equal(
+        small.means, pruned.means
+    )
     assert not small.means.requires_grad and not loaded.network.training
-    assert len(ps.compact(dense, 7, loaded).scene) == 7 and len(ps.compact(dense, 0.1, loaded).scene) == 6
+    assert (
+        len(ps.compact(dense, 7, loaded).scene) == 7
+        and len(ps.compact(dense, 0.1, loaded).scene) == 6
+    )
     with pytest.raises(BudgetError, match="keep is 0 Gaussians; expected at least 1"):
         ps.compact(dense, 0, loaded)
 
 
-def test_scenes_are_known_by_name_and_the_first_held_out_is_the_default(make_refined_run, trained_walls, tmp_path):
-    def scenes_and_shown(folder: str, eval_scenes: tuple[str, ...] = ()) -> tuple[dict[str, Path], str]:
+def test_scenes_are_known_by_name_and_the_first_held_out_is_the_default(
+    make_refined_run, trained_walls, tmp_path
+):
+    def scenes_and_shown(
+        folder: str, eval_scenes: tuple[str, ...] = ()
+    ) -> tuple[dict[str, Path], str]:
         run = make_refined_run(tmp_path / folder, trained_walls, eval_scenes)
         return scenes_of_run(open_refiner_run(run, need_data=True))
 
@@ -81,7 +104,8 @@ def test_scenes_are_known_by_name_and_the_first_held_out_is_the_default(make_ref
     assert list(scenes) == ["wall-a", "wall-b"] and shown == "wall-a"
     assert all(path.suffix == ".ckpt" and path.is_file() for path in scenes.values())
     assert scenes_and_shown("2", ("wall-b",))[1] == "wall-b"
-    # The viewer and ns-export show the first held-out scene by name, whatever the order on the command line was.
+    # The viewer and ns-export show the first held-out scene by name, whatever the order on the
+    # command line was.
     assert scenes_and_shown("3", ("wall-b", "wall-a"))[1] == "wall-a"
 
 
@@ -94,7 +118,9 @@ def test_the_refiner_alone_needs_no_scenes(make_refined_run, tmp_path):
 
 def test_runs_of_another_method_are_refused(trained_walls):
     (splatfacto,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    with pytest.raises(SceneError, match="a run of the method splatfacto-cpu; expected a pointsplat run"):
+    with pytest.raises(
+        SceneError, match="a run of the method splatfacto-cpu; expected a pointsplat run"
+    ):
         load_refiner(splatfacto)
 
 

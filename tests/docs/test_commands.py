@@ -1,7 +1,7 @@
 """Every command, option, path and Python example of the documentation is one that works.
 
-Commands are read by the parsers of the programs that they name, with the functions behind them taken out; those that
-make the example room small are really run, on a cut of it.
+Commands are read by the parsers of the programs that they name, with the functions behind them
+taken out; those that make the example room small are really run, on a cut of it.
 """
 
 import pkgutil
@@ -13,7 +13,17 @@ from pathlib import Path
 import pytest
 
 import pointsplat_ns as ps
-from documented import BLOCKS, COMMANDS, NS_PROGRAMS, PAGES, ROOT, check_arguments, help_of, inline_code, start
+from documented import (
+    BLOCKS,
+    COMMANDS,
+    NS_PROGRAMS,
+    PAGES,
+    ROOT,
+    check_arguments,
+    help_of,
+    inline_code,
+    start,
+)
 from pointsplat_ns.cli.help import EXAMPLES
 
 OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-print-completion"}
@@ -27,8 +37,11 @@ CUT = 1500
 
 
 def runs_quickly(words: tuple[str, ...]) -> bool:
-    """Whether a command makes the example room small with nothing else at hand and no optimisation."""
-    ours = words[:1] == ("pointsplat",) and words[1] in ("prune", "compact") and words[2] == "room.ply"
+    """Whether a command makes the example room small with nothing else at hand and no
+    optimisation."""
+    ours = (
+        words[:1] == ("pointsplat",) and words[1] in ("prune", "compact") and words[2] == "room.ply"
+    )
     takes_long = {"--seconds", "--target-db", "--photos"} & {*words}
     return ours and not takes_long and not any(word.startswith("outputs/") for word in words)
 
@@ -38,7 +51,9 @@ def kind(words: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted(re.sub(r"[\d.]+|\w+(?=\.[a-z]+$)", "", word) for word in words))
 
 
-QUICK = {kind(command.words): command for command in reversed(COMMANDS) if runs_quickly(command.words)}
+QUICK = {
+    kind(command.words): command for command in reversed(COMMANDS) if runs_quickly(command.words)
+}
 """Commands to run, each kind once however many pages show it."""
 PYTHON = sorted({block.page for block in BLOCKS if block.language == "python"})
 
@@ -54,7 +69,11 @@ def cut_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.where)
 def test_block_names_its_language_and_reads_a_room_that_was_written(block):
     assert block.language in ("bash", "python", "text")
-    read = [number for number, line in enumerate(block.text.splitlines()) if re.search(r"(?<![\w/])room\.ply", line)]
+    read = [
+        number
+        for number, line in enumerate(block.text.splitlines())
+        if re.search(r"(?<![\w/])room\.ply", line)
+    ]
     if read and block.language != "text":
         lines = block.page.read_text("utf-8").splitlines()
         assert any("pointsplat demo" in line for line in lines[: block.line + read[0]])
@@ -81,7 +100,9 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch):
         assert words[2].startswith("lab."), "no rule for this module"
         check_arguments(words, monkeypatch)
     elif program == "make":
-        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE)
+        targets = re.findall(
+            r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE
+        )
         assert {word for word in words[1:] if "=" not in word} <= set(targets)
     elif words[:2] == ("docker", "run"):
         check_arguments(words[words.index("pointsplat") :], monkeypatch)
@@ -99,12 +120,21 @@ def test_command_makes_the_room_small(command, cut_room, tmp_path, monkeypatch):
     default = "room_web.sog" if "--for" in words else default
     output = Path(words[words.index("-o") + 1] if "-o" in words else default)
     if "auto:35" in words:  # few Gaussians may all be needed
-        small, views = ps.load(output), ps.sample_views(ps.load("room.ply"), 12, 64, 48)  # as conftest.py has it
-        errors = (ps.render(small, views) - ps.render(ps.load("room.ply"), views)).double().square().mean()
+        # as conftest.py has it
+        small = ps.load(output)
+        views = ps.sample_views(ps.load("room.ply"), 12, 64, 48)
+        errors = (
+            (ps.render(small, views) - ps.render(ps.load("room.ply"), views))
+            .double()
+            .square()
+            .mean()
+        )
         assert errors < 10**-3.4  # 35 dB, and what the rounding of an SPZ adds
     else:
         assert 0 < len(ps.load(output)) < CUT + bool({"--for"} & {*words})  # all of it may fit
-    assert "--picture" not in words or Path(words[words.index("--picture") + 1]).stat().st_size > 1000
+    assert (
+        "--picture" not in words or Path(words[words.index("--picture") + 1]).stat().st_size > 1000
+    )
 
 
 @pytest.mark.parametrize("page", PYTHON, ids=lambda page: str(page.relative_to(ROOT)))
@@ -127,9 +157,19 @@ def test_readme_and_pages_for_users_are_short():
 
 def test_options_named_in_text_exist(monkeypatch, capsys):
     programs = [("pointsplat", name) for name in EXAMPLES]
-    programs += [("ns-train", "pointsplat"), ("ns-train", "splatfacto-cpu"), ("ns-render", "interpolate")]
-    programs += [("ns-train", "splatfacto-cpu", parser) for parser in ("replica-data", "scannetpp-seeded")]
-    programs += [("python", "-m", words[2]) for words in {c.words[:3] for c in COMMANDS} if "lab." in str(words[2:])]
+    programs += [
+        ("ns-train", "pointsplat"),
+        ("ns-train", "splatfacto-cpu"),
+        ("ns-render", "interpolate"),
+    ]
+    programs += [
+        ("ns-train", "splatfacto-cpu", parser) for parser in ("replica-data", "scannetpp-seeded")
+    ]
+    programs += [
+        ("python", "-m", words[2])
+        for words in {c.words[:3] for c in COMMANDS}
+        if "lab." in str(words[2:])
+    ]
     helps = "\n".join(help_of(words, monkeypatch, capsys) for words in programs)
     known = set(re.findall(r"--[a-z][\w.-]*", helps)) | OF_OTHERS | {"--help"}
     for page, code in inline_code():
@@ -138,7 +178,9 @@ def test_options_named_in_text_exist(monkeypatch, capsys):
 
 
 def test_training_options_named_in_text_are_accepted_with_their_values(monkeypatch):
-    named = {code for _, code in inline_code() if re.match(r"--\S+ \S", code) and "pipeline" in code}
+    named = {
+        code for _, code in inline_code() if re.match(r"--\S+ \S", code) and "pipeline" in code
+    }
     assert named, "expected some, such as `--pipeline.model.encoder concat`"
     for code in sorted(named):
         check_arguments(("ns-train", "pointsplat", *shlex.split(code)), monkeypatch)

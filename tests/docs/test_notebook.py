@@ -20,7 +20,8 @@ ps.save(ps.example_room()[::30], "room.ply")
 api.EXAMPLE, repair.STEPS["quick"], view_source.RESOLUTION = "room.ply", 2, (64, 48)
 settings.changed({QUICK}).__enter__()
 """
-"""Run before all cells: the scene that ships cut to a thirtieth, a repair of two steps, few and small views."""
+"""Run before all cells: the scene that ships cut to a thirtieth, a repair of two steps, few and
+small views."""
 
 
 def test_notebook_shows_three_pictures_and_says_what_compacting_brought(tmp_path, monkeypatch):
@@ -31,7 +32,9 @@ def test_notebook_shows_three_pictures_and_says_what_compacting_brought(tmp_path
     notebook.cells.insert(0, nbformat.v4.new_code_cell(SMALLER))
     resources = {"metadata": {"path": str(tmp_path)}}
     NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    outputs = [
+        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
+    ]
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
     said = "".join(output.text for output in outputs if output.output_type == "stream")
     assert "dB PSNR against the dense scene" in said

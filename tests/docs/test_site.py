@@ -47,11 +47,15 @@ def test_every_public_name_is_in_the_reference_with_its_example(site):
 
 
 def test_nothing_is_fetched_from_elsewhere_and_links_lead_to_pages(site):
-    assert 'href="../benchmarks.html"' in (site / "project" / "contributing.html").read_text("utf-8")
+    assert 'href="../benchmarks.html"' in (site / "project" / "contributing.html").read_text(
+        "utf-8"
+    )
     assert 'href="project/refiner.html"' in (site / "refining.html").read_text("utf-8")
     for page in site.rglob("*.html"):
         text = page.read_text("utf-8")
-        assert not re.findall(r'<(?:script|img|link rel="stylesheet"|iframe)[^>]+(?:src|href)="(?:https?:)?//', text)
+        assert not re.findall(
+            r'<(?:script|img|link rel="stylesheet"|iframe)[^>]+(?:src|href)="(?:https?:)?//', text
+        )
 
 
 def test_pictures_are_small():
@@ -62,7 +66,10 @@ def test_pictures_are_small():
 PAGE = "troubleshooting.md"
 
 MESSAGES = [
-    line for block in BLOCKS if block.page.name == PAGE and block.language == "text" for line in block.text.splitlines()
+    line
+    for block in BLOCKS
+    if block.page.name == PAGE and block.language == "text"
+    for line in block.text.splitlines()
 ]
 
 
@@ -87,20 +94,29 @@ TRIGGERS: dict[str, tuple[Callable[[], object], str]] = {
     "exists already": (lambda: Path("room_pruned.ply").touch(), "prune room.ply"),
     "cannot write a RAD": (room, "convert room.ply room.rad"),
     "a folder without config.yml": (lambda: Path("rooms").mkdir(), "lod rooms"),
-    "2D Gaussians": (write("flat.ply", lambda data: data.replace(b"scale_2\n", b"unknown\n")), "info flat.ply"),
+    "2D Gaussians": (
+        write("flat.ply", lambda data: data.replace(b"scale_2\n", b"unknown\n")),
+        "info flat.ply",
+    ),
     "dropped 1 of 4": (write("room.ply", odd), "convert room.ply other.ply"),
     "not a Splatfacto run": (room, "convert room.ply other.ply --original-frame"),
     "keep is 'half'": (room, "prune room.ply --keep half"),
-    "did you mean": (lambda: ps.save(ps.example_room(), "room.ply", overwrite=True), "prune room.ply --keep 10"),
+    "did you mean": (
+        lambda: ps.save(ps.example_room(), "room.ply", overwrite=True),
+        "prune room.ply --keep 10",
+    ),
     "opacity weight": (room, "prune room.ply --opacity-weight 0.5"),
     "no method": (room, "prune room.ply --by magic"),
     "refiner weights": (room, "compact room.ply --refiner nothing.safetensors"),
 }
-"""By a part of each message: what is done to the folder of the test, and the command that then gives the message."""
+"""By a part of each message: what is done to the folder of the test, and the command that then
+gives the message."""
 
 
 def test_every_message_has_a_command_that_gives_it():
-    assert [next(part for part in TRIGGERS if part in message) for message in MESSAGES] == [*TRIGGERS]
+    assert [next(part for part in TRIGGERS if part in message) for message in MESSAGES] == [
+        *TRIGGERS
+    ]
 
 
 @pytest.mark.parametrize("part", TRIGGERS)

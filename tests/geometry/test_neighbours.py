@@ -64,7 +64,8 @@ def test_the_nearest_of_other_places_are_those_of_brute_force(n, tree):
 
 
 def test_the_tree_of_torch_is_exact_for_any_distribution():
-    dense, g = points(2000, dtype=torch.float64), torch.Generator().manual_seed(1)
+    dense = points(2000, dtype=torch.float64)
+    g = torch.Generator().manual_seed(1)
     for where in (
         dense[:, :1] * torch.tensor([1.0, 2.0, 3.0]),  # a line
         torch.cat([dense, 1e7 + dense[:3]]),  # outliers, fewer than neighbours
@@ -72,12 +73,20 @@ def test_the_tree_of_torch_is_exact_for_any_distribution():
         dense / torch.rand(2000, 1, generator=g) ** 3,
     ):
         found = box_tree.BoxTree(where, 7).nearest(where, 7)[0]
-        torch.testing.assert_close(found, nearest(where, 7)[0], rtol=1e-14, atol=0)  # float64, in another order
+        torch.testing.assert_close(
+            found, nearest(where, 7)[0], rtol=1e-14, atol=0
+        )  # float64, in another order
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
 def test_where_there_are_fewer_others_a_points_own_index_stands_for_none(n, tree):
     near = other_neighbours(points(n).double(), 3)
-    assert near.shape == (n, 3) and near.dtype == torch.int32 and nearest(points(n), 9)[0].shape == (n, n)
+    assert (
+        near.shape == (n, 3)
+        and near.dtype == torch.int32
+        and nearest(points(n), 9)[0].shape == (n, n)
+    )
     for own, row in enumerate(near.tolist()):
-        assert sorted(row[: n - 1]) == [other for other in range(n) if other != own] and set(row[n - 1 :]) == {own}
+        assert sorted(row[: n - 1]) == [other for other in range(n) if other != own] and set(
+            row[n - 1 :]
+        ) == {own}

@@ -21,13 +21,15 @@ from making import normal_scene
 def saved_by_nerfstudio(scene, step=29999, prefix="_model.gauss_params."):
     """The content of a checkpoint with all that nerfstudio's trainer puts in one."""
     parameters = {name: torch.nn.Parameter(value.clone()) for name, value in scene.items()}
-    optimizers, schedulers = {}, {}
+    optimizers = {}
+    schedulers = {}
     for name, value in parameters.items():
         optimizer = torch.optim.Adam([value], lr=1e-3, eps=1e-15)
         value.grad = torch.ones_like(value)
         optimizer.step()
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: np.float64(0.5))
-        optimizers[name], schedulers[name] = optimizer.state_dict(), scheduler.state_dict()
+        optimizers[name] = optimizer.state_dict()
+        schedulers[name] = scheduler.state_dict()
     pipeline = {prefix + name: value for name, value in scene.items()}
     return {
         "step": step,
@@ -46,15 +48,23 @@ def checkpoint_of():
 @pytest.fixture(scope="session")
 def config_texts():
     """``config.yml`` of splatfacto and of nerfacto, as the installed nerfstudio dumps them."""
-    data, found = Path("data/kitchen"), {}
+    data = Path("data/kitchen")
+    found = {}
     for method, model in (("splatfacto", SplatfactoModelConfig()), ("nerfacto", ModelConfig())):
         parser = NerfstudioDataParserConfig(load_3D_points=True)
         manager = FullImageDatamanagerConfig(data=data, dataparser=parser)
-        optimizer = {"optimizer": AdamOptimizerConfig(lr=1e-3), "scheduler": ExponentialDecaySchedulerConfig()}
+        optimizer = {
+            "optimizer": AdamOptimizerConfig(lr=1e-3),
+            "scheduler": ExponentialDecaySchedulerConfig(),
+        }
         config = TrainerConfig(
-            method_name=method, data=data, output_dir=Path("outputs"), timestamp="2024-05-06_070809",
-            pipeline=VanillaPipelineConfig(datamanager=manager, model=model), optimizers={"means": optimizer},
-        )  # fmt: skip
+            method_name=method,
+            data=data,
+            output_dir=Path("outputs"),
+            timestamp="2024-05-06_070809",
+            pipeline=VanillaPipelineConfig(datamanager=manager, model=model),
+            optimizers={"means": optimizer},
+        )
         config.set_experiment_name()
         found[method] = yaml.dump(config)
     return found
@@ -62,7 +72,13 @@ def config_texts():
 
 @pytest.fixture
 def make_run(tmp_path, config_texts):
-    def make(experiment="kitchen", method="splatfacto", time="2024-05-06_070809", steps=(1999,), scene=None):
+    def make(
+        experiment="kitchen",
+        method="splatfacto",
+        time="2024-05-06_070809",
+        steps=(1999,),
+        scene=None,
+    ):
         folder = tmp_path / "outputs" / experiment / method / time
         (folder / "nerfstudio_models").mkdir(parents=True)
         text = config_texts.get(method, config_texts["splatfacto"])

@@ -1,4 +1,5 @@
-"""Files of cameras are read as their own projects read them; anything else is refused in one line, without harm."""
+"""Files of cameras are read as their own projects read them; anything else is refused in one line,
+without harm."""
 
 import math
 import os
@@ -23,19 +24,29 @@ def read_views(path: Path) -> ps.Views:
     return read_named_views(path).views
 
 
-def some_views(count: int = 12, width: int = 64, height: int = 48, centred: bool = False) -> ps.Views:
+def some_views(
+    count: int = 12, width: int = 64, height: int = 48, centred: bool = False
+) -> ps.Views:
     generator = torch.Generator().manual_seed(3)
     turns = rotation_matrices(torch.randn(count, 4, generator=generator, dtype=torch.float64))
     places = torch.randn(count, 3, 1, generator=generator, dtype=torch.float64)
     cx, cy = (width / 2, height / 2) if centred else (30.5, 25.25)
     K = torch.tensor([[50.0, 0, cx], [0, 52.0, cy], [0, 0, 1]], dtype=torch.float64)
     return ps.Views(
-        invert_rigid(torch.cat([turns, places], dim=2)), K.repeat(count, 1, 1), width, height, torch.zeros(3)
+        invert_rigid(torch.cat([turns, places], dim=2)),
+        K.repeat(count, 1, 1),
+        width,
+        height,
+        torch.zeros(3),
     )
 
 
 def need_same(found: ps.Views, expected: ps.Views, within: float = 1e-9) -> None:
-    assert (len(found), found.width, found.height) == (len(expected), expected.width, expected.height)
+    assert (len(found), found.width, found.height) == (
+        len(expected),
+        expected.width,
+        expected.height,
+    )
     torch.testing.assert_close(found.viewmats, expected.viewmats.double(), rtol=0, atol=within)
     torch.testing.assert_close(found.Ks, expected.Ks.double(), rtol=0, atol=within)
 
@@ -47,7 +58,9 @@ def without(content: dict, *names: str) -> dict:
 def framed(**changes) -> dict:
     """A ``transforms.json`` of one frame, which is changed; None takes a part away."""
     content = nerfstudio(some_views(1))
-    content["frames"][0] = {k: v for k, v in {**content["frames"][0], **changes}.items() if v is not None}
+    content["frames"][0] = {
+        k: v for k, v in {**content["frames"][0], **changes}.items() if v is not None
+    }
     return content
 
 
@@ -70,7 +83,12 @@ def test_cameras_are_those_that_were_written(kind, tmp_path):
 
 @pytest.mark.parametrize(
     ("model", "named"),
-    [("sparse/0", "."), ("sparse", "."), ("colmap/sparse/0", "."), ("sparse/0", "sparse/0/images.bin")],
+    [
+        ("sparse/0", "."),
+        ("sparse", "."),
+        ("colmap/sparse/0", "."),
+        ("sparse/0", "sparse/0/images.bin"),
+    ],
 )
 def test_the_model_of_a_colmap_project_is_found_below_its_root(model, named, tmp_path):
     views = some_views()
@@ -82,11 +100,19 @@ def test_the_model_of_a_colmap_project_is_found_below_its_root(model, named, tmp
 
 def test_a_camera_of_3dgs_looks_along_its_third_column(tmp_path):
     entry = {
-        "id": 0, "img_name": "a", "width": 60, "height": 40, "fx": 30.0, "fy": 30.0,
-        "position": [1.0, 2.0, 3.0], "rotation": [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]],
-    }  # fmt: skip
+        "id": 0,
+        "img_name": "a",
+        "width": 60,
+        "height": 40,
+        "fx": 30.0,
+        "fy": 30.0,
+        "position": [1.0, 2.0, 3.0],
+        "rotation": [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]],
+    }
     view = read_views(written([entry], tmp_path / "cameras.json"))[0]
-    ahead, below = torch.tensor([[3.0, 2.0, 3.0, 1.0], [3.0, 2.0, 2.0, 1.0]], dtype=torch.float64)  # z is up
+    ahead, below = torch.tensor(
+        [[3.0, 2.0, 3.0, 1.0], [3.0, 2.0, 2.0, 1.0]], dtype=torch.float64
+    )  # z is up
     torch.testing.assert_close((view.viewmat @ ahead)[:3], torch.tensor([0.0, 0.0, 2.0]).double())
     torch.testing.assert_close((view.viewmat @ below)[:3], torch.tensor([0.0, 1.0, 2.0]).double())
 
@@ -100,20 +126,32 @@ def test_poses_are_moved_to_where_nerfstudio_trains(tmp_path):
     (tmp_path / "images").mkdir()
     for frame in content["frames"]:
         Image.new("RGB", (64, 48)).save(tmp_path / frame["file_path"])
-    config = parsers.NerfstudioDataParserConfig(data=tmp_path, eval_mode="all", load_3D_points=False)
+    config = parsers.NerfstudioDataParserConfig(
+        data=tmp_path, eval_mode="all", load_3D_points=False
+    )
     outputs = config.setup().get_dataparser_outputs("train")
     outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
-    by_name = dict(zip((p.name for p in outputs.image_filenames), outputs.cameras.camera_to_worlds, strict=True))
+    by_name = dict(
+        zip(
+            (p.name for p in outputs.image_filenames), outputs.cameras.camera_to_worlds, strict=True
+        )
+    )
     expected = torch.stack([by_name[name_of(index)] for index in range(len(views))])
     # nerfstudio computes in float32
-    torch.testing.assert_close(viewmats_to_opengl(read_views(path).viewmats).float(), expected, rtol=0, atol=2e-6)
+    torch.testing.assert_close(
+        viewmats_to_opengl(read_views(path).viewmats).float(), expected, rtol=0, atol=2e-6
+    )
 
 
 def test_transforms_that_are_no_rigid_motion_are_refused(tmp_path):
     path = written(nerfstudio(some_views()), tmp_path / "transforms.json")
     doubled = {"transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]], "scale": 1}
     written(doubled, tmp_path / "dataparser_transforms.json")
-    fails(lambda: read_views(path), "dataparser_transforms.json: its transform is no rigid motion", error=ps.DataError)
+    fails(
+        lambda: read_views(path),
+        "dataparser_transforms.json: its transform is no rigid motion",
+        error=ps.DataError,
+    )
 
 
 @pytest.mark.parametrize(
@@ -124,7 +162,9 @@ def test_distortion_is_left_out_and_said_to_be(model, extra, tmp_path, caplog):
     views = some_views(3)
     text = write_sparse(views, tmp_path / "text", ".txt", model, extra)
     binary = write_sparse(views, tmp_path / "binary", ".bin", model, extra)
-    file = written({**nerfstudio(views), "camera_model": model, "k1": extra[0]}, tmp_path / "transforms.json")
+    file = written(
+        {**nerfstudio(views), "camera_model": model, "k1": extra[0]}, tmp_path / "transforms.json"
+    )
     for path in (text, binary, file):
         caplog.clear()
         need_same(read_views(path), views)
@@ -139,7 +179,9 @@ def test_distortion_is_left_out_and_said_to_be(model, extra, tmp_path, caplog):
         ("FULL_OPENCV", "50 51 30 20 1 2 3 4 5 6 7 8", (50, 51), (30, 20)),
     ],
 )
-def test_focal_lengths_and_principal_point_of_each_model_of_colmap(model, params, focal, centre, tmp_path):
+def test_focal_lengths_and_principal_point_of_each_model_of_colmap(
+    model, params, focal, centre, tmp_path
+):
     folder = write_sparse(some_views(1), tmp_path)
     (folder / "cameras.txt").write_text(f"3 {model} 64 48 {params}\n")
     K = read_views(folder).Ks[0]
@@ -154,7 +196,10 @@ def test_cameras_of_other_sizes_see_the_same_at_the_most_common_size(tmp_path):
 
 
 def inria_with(**changes) -> list:
-    return [*inria(some_views(1, centred=True)), {**inria(some_views(1, centred=True))[0], **changes}]
+    return [
+        *inria(some_views(1, centred=True)),
+        {**inria(some_views(1, centred=True))[0], **changes},
+    ]
 
 
 @pytest.mark.parametrize(
@@ -165,17 +210,29 @@ def inria_with(**changes) -> list:
         ([], "0 cameras; expected 1 to 100000"),
         (inria_with(position=[10**400, 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(position=[1e10, 0, 0]), r"camera 1 \(frame_0.png\) is too far away"),
-        (inria_with(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), r"the pose of camera 1 (.*)?is no rigid motion"),
+        (
+            inria_with(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
+            r"the pose of camera 1 (.*)?is no rigid motion",
+        ),
         (inria_with(fx=1e12), "camera 1 .* has no usable focal length"),
         ({"fl_x": 5, "w": 4, "h": 4, "frames": [3]}, "camera 0 is no frame"),
         (framed(cx=1e9), "camera 0 .* has its principal point far outside"),
-        (framed(camera_model="EQUIRECTANGULAR"), "camera 0 is 'EQUIRECTANGULAR'; expected one of SIMPLE_PINHOLE"),
-        ({**framed(), "applied_transform": [[1, 2]]}, "its 'applied_transform' or 'applied_scale' is not usable"),
-        ({**framed(), "applied_transform": [[0, 0, 0, 0]] * 3}, "its 'applied_transform' is no rigid motion"),
+        (
+            framed(camera_model="EQUIRECTANGULAR"),
+            "camera 0 is 'EQUIRECTANGULAR'; expected one of SIMPLE_PINHOLE",
+        ),
+        (
+            {**framed(), "applied_transform": [[1, 2]]},
+            "its 'applied_transform' or 'applied_scale' is not usable",
+        ),
+        (
+            {**framed(), "applied_transform": [[0, 0, 0, 0]] * 3},
+            "its 'applied_transform' is no rigid motion",
+        ),
         (without(framed(), "fl_x", "fl_y"), "camera 0 has no focal length"),
         (without(framed(), "w"), "camera 0 has no size; expected numbers 'w' and 'h'"),
     ],
-)  # fmt: skip
+)
 def test_other_json_is_refused_in_one_line(content, message, tmp_path):
     path = written(content, tmp_path / "cameras.json")
     said = fails(lambda: read_views(path), error=ps.DataError)
@@ -214,11 +271,26 @@ POINTS_AT = NAME_AT + len(name_of(0)) + 1
             damaged("cameras.txt", lambda _: b"3 EQUIRECTANGULAR 64 48 64 48\n"),
             "model EQUIRECTANGULAR; expected one of",
         ),
-        (damaged("images.txt", lambda _: b"1 1 0 0 0 0 0 0 3\n\n"), "images.txt: '1 1 0 0 0 0 0 0 3' is no image"),
-        (damaged("images.txt", lambda _: b"1 1 0 0 0 0 0 0 3 " + b"a" * 10_000), "a line of more than 4096 bytes"),
-        (images_with(0, struct.pack("<Q", 2**63)), r"images.bin: says that it has \d+ entries and has room for 2"),
-        (images_with(8 + 4, struct.pack("<d", math.nan)), "the pose of camera 0 .frame_0.png. is no rigid motion"),
-        (images_with(POINTS_AT, struct.pack("<Q", 2**62)), "an image with 4611686018427387904 points, for which the"),
+        (
+            damaged("images.txt", lambda _: b"1 1 0 0 0 0 0 0 3\n\n"),
+            "images.txt: '1 1 0 0 0 0 0 0 3' is no image",
+        ),
+        (
+            damaged("images.txt", lambda _: b"1 1 0 0 0 0 0 0 3 " + b"a" * 10_000),
+            "a line of more than 4096 bytes",
+        ),
+        (
+            images_with(0, struct.pack("<Q", 2**63)),
+            r"images.bin: says that it has \d+ entries and has room for 2",
+        ),
+        (
+            images_with(8 + 4, struct.pack("<d", math.nan)),
+            "the pose of camera 0 .frame_0.png. is no rigid motion",
+        ),
+        (
+            images_with(POINTS_AT, struct.pack("<Q", 2**62)),
+            "an image with 4611686018427387904 points, for which the",
+        ),
         (images_with(NAME_AT, b"a" * 20_000), "no end of an image's name within 4096 bytes"),
         (
             damaged("images.bin", lambda data: data[: NAME_AT + 3]),
@@ -233,7 +305,8 @@ def test_damaged_colmap_models_are_refused_in_one_line(write, message, tmp_path)
 
 
 def test_points_take_no_memory(tmp_path):
-    """One image with two million points, of which the file holds none on the disk, and one of text as long."""
+    """One image with two million points, of which the file holds none on the disk, and one of text
+    as long."""
     folder = write_sparse(some_views(1), tmp_path / "binary", ".bin")
     data = bytearray((folder / "images.bin").read_bytes())
     data[POINTS_AT:] = struct.pack("<Q", 2_000_000)
@@ -252,9 +325,14 @@ def test_points_take_no_memory(tmp_path):
 
 
 def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(ps.SceneError, match="no such file; expected cameras.json of 3DGS, transforms.json"):
+    with pytest.raises(
+        ps.SceneError, match="no such file; expected cameras.json of 3DGS, transforms.json"
+    ):
         read_views(tmp_path / "nothing.json")
-    fails(lambda: read_views(tmp_path), "a folder without cameras.bin or cameras.txt, there or in sparse/0; expected")
+    fails(
+        lambda: read_views(tmp_path),
+        "a folder without cameras.bin or cameras.txt, there or in sparse/0; expected",
+    )
     folder = write_sparse(some_views(2), tmp_path / "sparse", ".bin")
     (folder / "cameras.bin").unlink()
     with pytest.raises(ps.DataError, match="cameras.bin: no such file; expected a COLMAP model"):

@@ -1,4 +1,5 @@
-"""Configs of nerfstudio, and checkpoints of it and of gsplat's trainer, read without running anything."""
+"""Configs of nerfstudio, and checkpoints of it and of gsplat's trainer, read without running
+anything."""
 
 import logging
 import math
@@ -24,7 +25,9 @@ def fails(path, *fragments):
     assert text.startswith(str(path)) and len(text) < len(str(path)) + 400
 
 
-@pytest.mark.parametrize("prefix", ["_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module."])
+@pytest.mark.parametrize(
+    "prefix", ["_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module."]
+)
 def test_parameters_come_back_to_the_bit(tmp_path, checkpoint_of, prefix):
     scene = normal_scene(6, 3)
     torch.save(checkpoint_of(scene, prefix=prefix), tmp_path / "step-000000001.ckpt")
@@ -50,16 +53,21 @@ def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, checkpoint_
         found = read_scene(tmp_path / "a.ckpt")
     scene.opacities[0] = 30.0  # sigmoid(30) is 1 in float32
     assert same_bits(scene[[0, 1, 2, 4]], found)
-    assert caplog.messages == [f"{tmp_path / 'a.ckpt'}: dropped 1 of 5 Gaussians with NaN or infinite values"]
+    assert caplog.messages == [
+        f"{tmp_path / 'a.ckpt'}: dropped 1 of 5 Gaussians with NaN or infinite values"
+    ]
 
 
 NUMPY_CORE = np.float64.__reduce__(np.float64(1))[0].__module__.split(".")[1]
 
 
 def rewritten(path, change):
-    """The file with the data of each entry as ``change`` makes it of name and data; what is in it then."""
+    """The file with the data of each entry as ``change`` makes it of name and data; what is in it
+    then."""
     with zipfile.ZipFile(path) as archive:
-        entries = {info.filename: change(info.filename, archive.read(info)) for info in archive.infolist()}
+        entries = {
+            info.filename: change(info.filename, archive.read(info)) for info in archive.infolist()
+        }
     with zipfile.ZipFile(path, "w") as archive:
         for name, data in entries.items():
             archive.writestr(name, data)
@@ -76,8 +84,12 @@ def test_a_checkpoint_written_with_either_numpy_loads(tmp_path, checkpoint_of, c
     assert same_bits(normal_scene(), read_checkpoint(path))
 
 
-@pytest.mark.parametrize(("extra", "kind"), [(Bomb(), "print"), (np.array([1, "a"], dtype=object), "numpy")])
-def test_a_checkpoint_that_would_run_code_is_refused_and_runs_none(tmp_path, checkpoint_of, capsys, extra, kind):
+@pytest.mark.parametrize(
+    ("extra", "kind"), [(Bomb(), "print"), (np.array([1, "a"], dtype=object), "numpy")]
+)
+def test_a_checkpoint_that_would_run_code_is_refused_and_runs_none(
+    tmp_path, checkpoint_of, capsys, extra, kind
+):
     torch.save({**checkpoint_of(normal_scene()), "extra": extra}, tmp_path / "a.ckpt")
     fails(tmp_path / "a.ckpt", f"holds an object of type {'' if kind == 'print' else kind}", kind)
     assert "never" not in capsys.readouterr().out
@@ -96,19 +108,34 @@ def test_a_compressed_archive_is_not_unpacked(tmp_path):
     fails(tmp_path / "a.ckpt", "compressed archive")
 
 
-OTHER_METHOD = {"step": 1, "pipeline": {f"_model.field.mlp.{i}.weight": torch.zeros(2) for i in range(6)}}
+OTHER_METHOD = {
+    "step": 1,
+    "pipeline": {f"_model.field.mlp.{i}.weight": torch.zeros(2) for i in range(6)},
+}
 
 
 @pytest.mark.parametrize(
     ("content", "found"),
     [
-        *((some, ["expected a checkpoint that Splatfacto or gsplat saved"])
-          for some in (b"", b"hello", b"PK", bytes(5000), b"\x80\x02}q\x00.")),
-        ({"state_dict": {}, "epoch": 3}, ["not a checkpoint of a scene", "found epoch, state_dict"]),
-        (OTHER_METHOD,
-         ["another method", "_model.field.mlp.0.weight", "and 2 more", "_model.gauss_params.means"]),
+        *(
+            (some, ["expected a checkpoint that Splatfacto or gsplat saved"])
+            for some in (b"", b"hello", b"PK", bytes(5000), b"\x80\x02}q\x00.")
+        ),
+        (
+            {"state_dict": {}, "epoch": 3},
+            ["not a checkpoint of a scene", "found epoch, state_dict"],
+        ),
+        (
+            OTHER_METHOD,
+            [
+                "another method",
+                "_model.field.mlp.0.weight",
+                "and 2 more",
+                "_model.gauss_params.means",
+            ],
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_is_no_checkpoint_is_an_error_that_names_its_content(tmp_path, content, found):
     path = tmp_path / "a.ckpt"
     path.write_bytes(content) if isinstance(content, bytes) else torch.save(content, path)
@@ -118,18 +145,25 @@ def test_a_file_that_is_no_checkpoint_is_an_error_that_names_its_content(tmp_pat
 @pytest.mark.parametrize(
     ("name", "value", "fragment"),
     [
-        *((name, None, f"lacks the key '_model.gauss_params.{name}'")
-          for name in ("scales", "quats", "opacities", "features_dc", "features_rest")),
+        *(
+            (name, None, f"lacks the key '_model.gauss_params.{name}'")
+            for name in ("scales", "quats", "opacities", "features_dc", "features_rest")
+        ),
         ("quats", torch.zeros(4, 3), "quats has shape (4, 3); expected (5, 4)"),
         ("quats", torch.zeros(5, 4).to_sparse(), "expected a dense floating-point tensor"),
         ("quats", [1.0], "is list"),
         ("quats", torch.zeros(1).expand(10**12, 4), "more than the file can hold"),
     ],
-)  # fmt: skip
-def test_a_parameter_that_is_missing_or_cannot_be_one_is_named(tmp_path, checkpoint_of, name, value, fragment):
+)
+def test_a_parameter_that_is_missing_or_cannot_be_one_is_named(
+    tmp_path, checkpoint_of, name, value, fragment
+):
     content = checkpoint_of(normal_scene())
     state = {**content["pipeline"], "_model.gauss_params." + name: value}
-    torch.save({**content, "pipeline": {k: v for k, v in state.items() if v is not None}}, tmp_path / "a.ckpt")
+    torch.save(
+        {**content, "pipeline": {k: v for k, v in state.items() if v is not None}},
+        tmp_path / "a.ckpt",
+    )
     fails(tmp_path / "a.ckpt", fragment, name)
 
 
@@ -137,8 +171,14 @@ GOOD = normal_scene(4, 1)
 
 
 def splats_of(scene):
-    """What ``splats.state_dict()`` of gsplat's simple_trainer holds: a ParameterDict, opacities (N,), sh0 (N, 1, 3)."""
-    values = {"means": scene.means, "scales": scene.scales, "quats": scene.quats, "opacities": scene.opacities[:, 0]}
+    """What ``splats.state_dict()`` of gsplat's simple_trainer holds: a ParameterDict, opacities
+    (N,), sh0 (N, 1, 3)."""
+    values = {
+        "means": scene.means,
+        "scales": scene.scales,
+        "quats": scene.quats,
+        "opacities": scene.opacities[:, 0],
+    }
     values |= {"sh0": scene.features_dc[:, None], "shN": scene.features_rest}
     return torch.nn.ParameterDict(
         {name: torch.nn.Parameter(value.clone()) for name, value in values.items()}
@@ -149,12 +189,20 @@ def splats_of(scene):
 def test_a_checkpoint_of_gsplat_is_read_to_the_bit(tmp_path, degree):
     scene = normal_scene(7, degree)
     path = tmp_path / "ckpt_29999_rank0.pt"
-    torch.save({"step": 29999, "splats": splats_of(scene), "pose_adjust": {"embeds.weight": torch.zeros(3, 9)}}, path)
+    torch.save(
+        {
+            "step": 29999,
+            "splats": splats_of(scene),
+            "pose_adjust": {"embeds.weight": torch.zeros(3, 9)},
+        },
+        path,
+    )
     assert same_bits(read_scene(path), scene) and kind_of(path) == "checkpoint"
 
 
 @pytest.mark.parametrize(
-    "settings", ["antialiased: true\n", "antialiased: false\n", "nested:\n  antialiased: true\n", None]
+    "settings",
+    ["antialiased: true\n", "antialiased: false\n", "nested:\n  antialiased: true\n", None],
 )
 def test_settings_of_a_gsplat_training_tell_whether_it_is_antialiased(tmp_path, settings):
     path = tmp_path / "results" / "ckpts" / "ckpt_29999_rank0.pt"
@@ -162,7 +210,10 @@ def test_settings_of_a_gsplat_training_tell_whether_it_is_antialiased(tmp_path, 
     torch.save({"step": 29999, "splats": splats_of(GOOD)}, path)
     if settings is not None:
         config = tmp_path / "results" / "cfg.yml"
-        config.write_text(f"absgrad: false\n{settings}strategy: !!python/object:gsplat.strategy.DefaultStrategy {{}}\n")
+        config.write_text(
+            f"absgrad: false\n{settings}strategy: !!python/object:gsplat.strategy.DefaultStrategy "
+            f"{{}}\n"
+        )
     assert read_scene(path).antialiased == (settings == "antialiased: true\n")
 
 
@@ -252,11 +303,23 @@ def nested(first, line, depth, *last):
 @pytest.mark.parametrize(
     ("text", "fragment"),
     [
-        # As a key a tuple is hashed, and a name is made to text: both would take the time and memory of all values.
-        (nested("[a]", "x{i}: &x{i} [*x{before}, *x{before}]", 20, "? *x19", ": 1"), "more than 65536 values"),
-        (nested("[a]", "x{i}: &x{i} !!python/tuple [*x{before}, *x{before}]", 20, "? *x19", ": 1"), "65536 values"),
+        # As a key a tuple is hashed, and a name is made to text: both would take the time and
+        # memory of all values.
+        (
+            nested("[a]", "x{i}: &x{i} [*x{before}, *x{before}]", 20, "? *x19", ": 1"),
+            "more than 65536 values",
+        ),
+        (
+            nested(
+                "[a]", "x{i}: &x{i} !!python/tuple [*x{before}, *x{before}]", 20, "? *x19", ": 1"
+            ),
+            "65536 values",
+        ),
         ("!!python/object:a.B\nmethod_name: &x [*x]", "holds itself"),
-        (nested("{k: v}", "x{i}: &x{i} {{<<: [*x{before}, *x{before}]}}", 4), "merge keys are not supported at line 3"),
+        (
+            nested("{k: v}", "x{i}: &x{i} {{<<: [*x{before}, *x{before}]}}", 4),
+            "merge keys are not supported at line 3",
+        ),
         (b"\xff\xfe\xff", "not a nerfstudio config.yml"),
         ("a: 1", "expected a saved trainer configuration"),
         ("!!python/object:a.B {? [1, 2] : 3}", "unhashable"),

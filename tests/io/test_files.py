@@ -31,7 +31,9 @@ def test_a_name_that_is_too_long_is_the_error_that_is_told(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("path", ["/proc/a.ply", "/dev/null/a.ply", "/dev/null", "file/a.ply", "nul\0/a.ply"])
+@pytest.mark.parametrize(
+    "path", ["/proc/a.ply", "/dev/null/a.ply", "/dev/null", "file/a.ply", "nul\0/a.ply"]
+)
 def test_a_place_where_no_file_can_be_is_one_error(tmp_path, path):
     (tmp_path / "file").touch()
     said = "a.ply: cannot be written|/dev/null: not a regular file|holds a NUL character"
@@ -43,7 +45,8 @@ def test_a_place_where_no_file_can_be_is_one_error(tmp_path, path):
 @pytest.mark.parametrize("relative", [True, False])
 def test_output_through_a_link_is_written_to_its_target(tmp_path, relative):
     (tmp_path / "real").mkdir()
-    target, link = tmp_path / "real" / "a.ply", tmp_path / "link.ply"
+    target = tmp_path / "real" / "a.ply"
+    link = tmp_path / "link.ply"
     target.write_text("old")
     link.symlink_to("real/a.ply" if relative else target)
     write(link)
@@ -56,7 +59,9 @@ def test_a_link_that_leads_nowhere_is_refused_and_makes_no_file(target, tmp_path
     """Whoever made it may want a file to appear there, such as one that a shell runs."""
     link = tmp_path / "link.ply"
     link.symlink_to(target)
-    with pytest.raises(SceneError, match="link.ply: (a link to .*, where nothing is; remove it|not a regular file)"):
+    with pytest.raises(
+        SceneError, match="link.ply: (a link to .*, where nothing is; remove it|not a regular file)"
+    ):
         write(link)
     assert [*tmp_path.iterdir()] == [link] and link.is_symlink()
 
@@ -68,7 +73,9 @@ def test_a_file_that_is_replaced_keeps_its_mode(tmp_path, mode):
     path.chmod(mode)
     with replacing(path) as part:
         part.write_text("new")
-        assert stat.S_IMODE(part.stat().st_mode) & 0o077 == 0, "others could read it before it is complete"
+        assert stat.S_IMODE(part.stat().st_mode) & 0o077 == 0, (
+            "others could read it before it is complete"
+        )
     assert path.read_text() == "new" and stat.S_IMODE(path.stat().st_mode) == mode
 
 
@@ -76,7 +83,9 @@ def test_a_file_that_is_replaced_keeps_its_mode(tmp_path, mode):
 def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
     path = tmp_path / name
     ps.save(cloud(3), path)
-    with pytest.raises(SceneError, match="exists already; name another file, or replace it with overwrite=True"):
+    with pytest.raises(
+        SceneError, match="exists already; name another file, or replace it with overwrite=True"
+    ):
         ps.save(cloud(4), path)
     assert len(ps.load(path)) == 3
     ps.save(cloud(4), path, overwrite=True)
@@ -139,11 +148,18 @@ def test_results_of_earlier_commands_are_no_scenes(tmp_path, caplog):
         save(cloud(50, 0, 1), tmp_path / name)
     (tmp_path / "room_lod" / "lod.json").touch()
     assert [*find_scenes(tmp_path)] == ["deep/room_pruned", "other_compact", "room"]
-    assert f"passed over {tmp_path / 'room_compact.spz'}: a result of {tmp_path / 'room'}" in caplog.text
+    assert (
+        f"passed over {tmp_path / 'room_compact.spz'}: a result of {tmp_path / 'room'}"
+        in caplog.text
+    )
 
 
-@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(1)", "\t=1", "\r=1", "\N{FULLWIDTH EQUALS SIGN}1"])
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+1", "-1", "@SUM(1)", "\t=1", "\r=1", "\N{FULLWIDTH EQUALS SIGN}1"]
+)
 def test_a_text_that_is_a_formula_gets_an_apostrophe(text, tmp_path):
     write_csv([{"name": text, "loss": -1.5, "note": "a=b", "none": None}], tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(newline="") as stream:
-        assert [*csv.DictReader(stream)] == [{"name": f"'{text}", "loss": "-1.5", "note": "a=b", "none": ""}]
+        assert [*csv.DictReader(stream)] == [
+            {"name": f"'{text}", "loss": "-1.5", "note": "a=b", "none": ""}
+        ]

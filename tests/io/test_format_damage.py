@@ -1,5 +1,5 @@
-"""Scene files that are cut short or lie: one SceneError each, and no memory for what is not there. Of garbled ones,
-``tests/lab/fuzz_corpus`` has those that reach every branch."""
+"""Scene files that are cut short or lie: one SceneError each, and no memory for what is not there.
+Of garbled ones, ``tests/lab/fuzz_corpus`` has those that reach every branch."""
 
 import gzip
 import io
@@ -103,8 +103,14 @@ def image(width, height):
         (dict(meta=lambda meta: meta.update(count=10**5)), "pixels"),
         (dict(meta=lambda meta: meta.update(count=10**8)), "compressed bytes can hold"),
         (dict(meta=lambda meta: meta.update(count="many")), "declares 'many'"),
-        (dict(meta=lambda meta: meta["means"].update(files=["../../etc/passwd", "x"])), "beside meta.json"),
-        (dict(meta=lambda meta: meta["scales"].update(codebook=[0.0] * 10**4)), "a codebook of 10000"),
+        (
+            dict(meta=lambda meta: meta["means"].update(files=["../../etc/passwd", "x"])),
+            "beside meta.json",
+        ),
+        (
+            dict(meta=lambda meta: meta["scales"].update(codebook=[0.0] * 10**4)),
+            "a codebook of 10000",
+        ),
         (dict(meta=lambda meta: meta["shN"].update(count=10**9)), "a palette of 1000000000"),
         (dict(meta=lambda meta: meta.pop("quats")), "lacks 'quats'"),
         (dict(meta=b"[" * 100_000), "damaged"),
@@ -123,7 +129,11 @@ def test_a_sog_that_lies_is_refused_by_what_is_wrong(tmp_path, change, fragment)
     "old, new, fragment",
     [
         (b"element vertex 300", b"element vertex 300000000", "chunks for 300000000"),
-        (b"uint packed_rotation", b"float packed_rotation", "lacks the uint32 property 'packed_rotation'"),
+        (
+            b"uint packed_rotation",
+            b"float packed_rotation",
+            "lacks the uint32 property 'packed_rotation'",
+        ),
         (b"element sh 300", b"element sh 200", "'sh' has 200 rows"),
         (b"element chunk 2", b"element other 2", "lacks the element 'chunk'"),
         (b"binary_little_endian", b"binary_big_endian", "another byte order"),
@@ -138,14 +148,19 @@ def test_a_compressed_ply_that_lies_is_refused_by_what_is_wrong(tmp_path, old, n
 @pytest.mark.parametrize("version", [3, 4])
 def test_an_spz_of_nothing_but_zeros_takes_no_memory(tmp_path, version):
     """What its header declares is there, in a thousandth of the bytes."""
-    count, path = 10**6, tmp_path / "a.spz"
+    count = 10**6
+    path = tmp_path / "a.spz"
     head = struct.pack("<4sIIBBBB", b"NGSP", version, count, 0, 12, 0, 5 if version == 4 else 0)
     sizes = [9 * count, count, 3 * count, 3 * count, 4 * count]
     if version == 3:
         path.write_bytes(gzip.compress(head + bytes(sum(sizes))))
     else:
         streams = [zstandard.ZstdCompressor().compress(bytes(size)) for size in sizes]
-        table = b"".join(struct.pack("<QQ", len(s), size) for s, size in zip(streams, sizes, strict=True))
-        path.write_bytes(head + struct.pack("<I12x", 32) + table + b"".join(streams) + bytes(20_000))
+        table = b"".join(
+            struct.pack("<QQ", len(s), size) for s, size in zip(streams, sizes, strict=True)
+        )
+        path.write_bytes(
+            head + struct.pack("<I12x", 32) + table + b"".join(streams) + bytes(20_000)
+        )
     assert most_memory(refused, path) < 3e6  # 20 MB are in it, and 56 MB would be made of it
     refused(path, "more than")

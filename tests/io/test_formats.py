@@ -1,4 +1,5 @@
-"""Scene files of every format: whatever its name, a file is what its content tells; what comes back; sizes."""
+"""Scene files of every format: whatever its name, a file is what its content tells; what comes
+back; sizes."""
 
 import gzip
 import io
@@ -32,7 +33,10 @@ def torch_bytes(content, **options):
 
 
 def checkpoint(step=7):
-    return {"step": step, "pipeline": {f"_model.gauss_params.{name}": value for name, value in SCENE.items()}}
+    return {
+        "step": step,
+        "pipeline": {f"_model.gauss_params.{name}": value for name, value in SCENE.items()},
+    }
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +52,10 @@ def contents(tmp_path_factory):
         "SPZ 4": (encode_spz4(SCENE), ".spz"),
         "SOG": (encode_sog(SCENE), ".sog"),
         "checkpoint": (torch_bytes(checkpoint()), ".ckpt"),
-        "checkpoint of old torch": (torch_bytes(checkpoint(), _use_new_zipfile_serialization=False), ".ckpt"),
+        "checkpoint of old torch": (
+            torch_bytes(checkpoint(), _use_new_zipfile_serialization=False),
+            ".ckpt",
+        ),
     }
     scenes = {}
     for name, (data, suffix) in found.items():
@@ -72,7 +79,12 @@ def test_content_decides_for_every_format_under_every_name(tmp_path, contents, n
 
 
 def test_a_renamed_file_is_written_again_as_what_it_is(tmp_path, contents):
-    for kind, wanted in (("3DGS PLY", ".ply"), ("compressed PLY", ".sog"), ("SPZ 3", ".spz"), ("SOG", ".sog")):
+    for kind, wanted in (
+        ("3DGS PLY", ".ply"),
+        ("compressed PLY", ".sog"),
+        ("SPZ 3", ".spz"),
+        ("SOG", ".sog"),
+    ):
         path = tmp_path / "x.splat"
         path.write_bytes(contents[kind][0])
         assert format_like(path).suffix == wanted
@@ -82,17 +94,24 @@ def test_a_renamed_file_is_written_again_as_what_it_is(tmp_path, contents):
 def test_a_folder_is_searched_by_what_its_files_hold(tmp_path, contents, caplog):
     (tmp_path / "a.ply").write_bytes(contents["SPZ 3"][0])
     (tmp_path / "b.splat").write_bytes(contents["3DGS PLY"][0])
-    (tmp_path / "c.spz").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
+    (tmp_path / "c.spz").write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n"
+    )
     assert [*find_scenes(tmp_path)] == ["a", "b"]
     assert "c.spz: no Gaussians in it" in caplog.text
     (tmp_path / "d.ply").write_bytes(b"ply\n")
-    (tmp_path / "e.sog").write_bytes(contents["SOG"][0][:-50])  # a scene that is damaged is none that is passed over
+    (tmp_path / "e.sog").write_bytes(
+        contents["SOG"][0][:-50]
+    )  # a scene that is damaged is none that is passed over
     assert [*find_scenes(tmp_path)] == ["a", "b", "e"]
     assert "d.ply: no Gaussians in it" in caplog.text
 
 
 REFUSED = {
-    "x.ply": (zip_of({"document.json": "{}", "splat_0.ply": "ply\n"}), "SuperSplat project files are not read; open"),
+    "x.ply": (
+        zip_of({"document.json": "{}", "splat_0.ply": "ply\n"}),
+        "SuperSplat project files are not read; open",
+    ),
     "x.ssproj": (b"anything", "SuperSplat project"),
     "x.zip": (zip_of({"lod-meta.json": "{}", "0_0/meta.json": "{}"}), "zip of a streamed SOG"),
     "x.sog": (
@@ -105,7 +124,10 @@ REFUSED = {
     "y.ply": (b"<!DOCTYPE html><html>", "web page"),
     "y.splat": (b"LASF" + bytes(60), "LAS point cloud"),
     "z.ply": (b"PXR-USDC" + bytes(60), "USD files are not read"),
-    "y.zip": (zip_of({"room/a.ply": "ply\n"}), "zip of a PLY files are not read; unpack it and name the PLY"),
+    "y.zip": (
+        zip_of({"room/a.ply": "ply\n"}),
+        "zip of a PLY files are not read; unpack it and name the PLY",
+    ),
     "z.zip": (zip_of({"a.ply": "ply\n" * 99})[:-30], "a zip archive that is truncated or damaged"),
     "z.splat": (b"# a text of words and numbers 32\n" * 32, "text"),
     "z.spz": (gzip.compress(b"ply\nformat ascii 1.0\n"), "SPZ of b'ply\\n'"),
@@ -117,14 +139,18 @@ REFUSED = {
 def test_what_is_not_read_is_refused_by_what_it_is(tmp_path, name):
     data, said = REFUSED[name]
     (tmp_path / name).write_bytes(data)
-    assert fails(lambda: ps.load(tmp_path / name), said, error=ps.SceneError).startswith(str(tmp_path / name))
+    assert fails(lambda: ps.load(tmp_path / name), said, error=ps.SceneError).startswith(
+        str(tmp_path / name)
+    )
 
 
 def test_info_names_runs_and_checkpoints_in_them_with_method_and_step(tmp_path, capsys):
     path = write_run(tmp_path / "run", 8, 100)
     torch.save(checkpoint(), path)
     config = tmp_path / "run" / "config.yml"
-    config.write_text(config.read_text().replace("max_num", "method_name: splatfacto-big\nmax_num", 1))
+    config.write_text(
+        config.read_text().replace("max_num", "method_name: splatfacto-big\nmax_num", 1)
+    )
     names = [ps.info(place).format for place in (tmp_path / "run", config, path)]
     assert names == ["run of splatfacto-big, step 7"] * 2 + ["checkpoint of splatfacto-big, step 7"]
 
@@ -152,7 +178,9 @@ def test_spz_4_is_read_as_spz_3_and_extensions_are_said_to_be_left_out(tmp_path,
 
 
 def test_degree_4_of_a_ply_is_read_up_to_3(tmp_path, caplog):
-    columns = columns_of(cloud(2, 0, 3)) | {f"f_rest_{i}": np.full(2, i / 64, np.float32) for i in range(72)}
+    columns = columns_of(cloud(2, 0, 3)) | {
+        f"f_rest_{i}": np.full(2, i / 64, np.float32) for i in range(72)
+    }
     write_columns(tmp_path / "a.ply", columns)
     scene = ps.load(tmp_path / "a.ply")
     assert scene.sh_degree == 3 and "SH degree 4, read up to degree 3" in caplog.text

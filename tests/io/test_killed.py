@@ -84,14 +84,16 @@ for here in sorted(base.glob("*/*/")):
     shutil.copytree(here / "before", here / "out")
     {"killed": at_every_operation, "full": full}[here.parent.name](WRITERS[here.name])
 """
-"""Does the work of all tests here: forks children of one process that has imported everything, which takes seconds."""
+"""Does the work of all tests here: forks children of one process that has imported everything,
+which takes seconds."""
 
 KINDS = {"killed": ("ply", "levels"), "full": ("ply", "sog")}
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory) -> Path:
-    """A folder with one of each kind for each test, ``before`` and ``out`` in it, and what was ``said``."""
+    """A folder with one of each kind for each test, ``before`` and ``out`` in it, and what was
+    ``said``."""
     base = tmp_path_factory.mktemp("work")
     ps.save(cloud(50, 1, 0), base / "new.ply")
     for what, kinds in KINDS.items():
@@ -111,7 +113,9 @@ def work(tmp_path_factory) -> Path:
 def shown(folder: Path) -> dict[str, bytes]:
     """The files below a folder, but for what is unfinished, which is hidden."""
     files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in files.items() if not path.name.startswith(".")}
+    return {
+        name: path.read_bytes() for name, path in files.items() if not path.name.startswith(".")
+    }
 
 
 @pytest.mark.parametrize("kind", KINDS["killed"])
@@ -128,7 +132,9 @@ def test_a_killed_writer_leaves_the_old_file_or_the_new_one(kind, work):
         if kind == "levels":  # its parts belong together: this file is there only with all of them
             assert "lod/lod.json" not in left or left in (before, after), kill.name
         else:
-            assert all(data in (before.get(name), after.get(name)) for name, data in left.items()), kill.name
+            assert all(
+                data in (before.get(name), after.get(name)) for name, data in left.items()
+            ), kill.name
     assert unfinished > 1
 
 
@@ -136,7 +142,10 @@ def test_a_killed_writer_leaves_the_old_file_or_the_new_one(kind, work):
 def test_a_file_beyond_the_size_limit_is_one_error_and_the_old_stays(kind, work):
     place = work / "full" / kind
     said = (place / "said.txt").read_text()
-    assert said.startswith(f"SceneError: {place / 'out'}") and "cannot be written (File too large)" in said
+    assert (
+        said.startswith(f"SceneError: {place / 'out'}")
+        and "cannot be written (File too large)" in said
+    )
     assert shown(place / "out") == shown(place / "before") and not list((place / "out").rglob(".*"))
 
 
@@ -144,7 +153,9 @@ def test_a_disk_without_room_is_told_before_anything_is_written(tmp_path, monkey
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3000))
     path = tmp_path / "a.ply"
-    with pytest.raises(SceneError, match=r"a\.ply: needs 3\.81 kB, 3\.00 kB are free there, so nothing"):
+    with pytest.raises(
+        SceneError, match=r"a\.ply: needs 3\.81 kB, 3\.00 kB are free there, so nothing"
+    ):
         ps.save(cloud(50, 1, 0), path)
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(total=0, free=0))

@@ -1,4 +1,5 @@
-"""Scenes far from the origin: doubles keep their digits beside an offset, which files, poses and turns carry."""
+"""Scenes far from the origin: doubles keep their digits beside an offset, which files, poses and
+turns carry."""
 
 import logging
 from dataclasses import replace
@@ -21,7 +22,9 @@ UTM = (451_234.6, 5_412_345.7, 312.4)
 def with_doubles(scene, path, origin=UTM, order="<", text=False, comments=()):
     """Write a PLY whose x, y and z are doubles about an origin, and return them, float64."""
     means = scene.means.double().numpy() + np.array(origin)
-    write_columns(path, columns_of(scene) | dict(zip("xyz", means.T, strict=True)), text, order, comments)
+    write_columns(
+        path, columns_of(scene) | dict(zip("xyz", means.T, strict=True)), text, order, comments
+    )
     return means
 
 
@@ -60,7 +63,10 @@ def test_files_carry_the_offset(tmp_path, suffix, caplog):
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".splat"])
 def test_files_that_cannot_carry_the_offset_say_so(tmp_path, suffix, caplog):
-    ps.save(cloud(300, sh_degree=0).replace(offset=UTM, features_dc=torch.zeros(300, 3)), tmp_path / f"a{suffix}")
+    ps.save(
+        cloud(300, sh_degree=0).replace(offset=UTM, features_dc=torch.zeros(300, 3)),
+        tmp_path / f"a{suffix}",
+    )
     assert caplog.text.count("the offset 451234.6 5412345.7 312.4 of positions; .ply keeps it") == 1
 
 
@@ -92,17 +98,22 @@ def test_turned_and_scaled_scenes_turn_and_scale_their_offset():
 
 
 def test_scenes_of_different_offsets_are_joined_in_the_frame_of_the_first():
-    one, other = cloud(10).replace(offset=UTM), cloud(10, 1).replace(offset=(451_230.0, 5_412_340.0, 310.0))
+    one = cloud(10).replace(offset=UTM)
+    other = cloud(10, 1).replace(offset=(451_230.0, 5_412_340.0, 310.0))
     both = ps.Gaussians.cat([one, other])
     assert both.offset == UTM
-    assert np.allclose(absolute(both), np.concatenate([absolute(one), absolute(other)]), rtol=0, atol=1e-6)
+    assert np.allclose(
+        absolute(both), np.concatenate([absolute(one), absolute(other)]), rtol=0, atol=1e-6
+    )
 
 
 def test_poses_of_a_file_are_in_the_frame_of_the_scene_s_file(tmp_path):
     scene = ball(400)
     with_doubles(scene, tmp_path / "a.ply")
     views = ps.sample_views(scene, 3, width=96, height=64)
-    there = replace(views, viewmats=views.viewmats.double()).relative_to(tuple(-value for value in UTM))
+    there = replace(views, viewmats=views.viewmats.double()).relative_to(
+        tuple(-value for value in UTM)
+    )
     written(inria(there), tmp_path / "cameras.json")
     dense, given, _ = read_found(tmp_path / "a.ply", tmp_path / "cameras.json")
     with torch.no_grad():

@@ -23,7 +23,9 @@ FISHEYE = Lens("OPENCV_FISHEYE", (-0.02, 0.004, 0.0, 0.0))
 
 def camera(width: int = 64, height: int = 48, **changes) -> Camera:
     pose = torch.eye(4).flatten().tolist()
-    return Camera("a.png", pose, (width, height), (50.0, 50.0), (width / 2, height / 2))._replace(**changes)
+    return Camera("a.png", pose, (width, height), (50.0, 50.0), (width / 2, height / 2))._replace(
+        **changes
+    )
 
 
 def saved(array: np.ndarray, path: Path, **options) -> Path:
@@ -57,36 +59,48 @@ def test_photos_of_any_lens_are_those_of_a_pinhole(kind, lens, tmp_path):
         photo = reader.read(files[index], named.cameras[index])
         u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
         K = photo.K.numpy()
-        rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+        rays = np.stack(
+            [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1
+        )
         pose = capture.poses[index]
         expected = colors_at(seen_from(pose[:3, 3], rays @ (pose @ OPENCV_TO_OPENGL)[:3, :3].T))
         apart = np.abs(photo.image.numpy() / 255 - expected).max(axis=-1)
-        shown = np.ones_like(apart, dtype=bool) if photo.mask is None else photo.mask[..., 0].numpy()
+        shown = (
+            np.ones_like(apart, dtype=bool) if photo.mask is None else photo.mask[..., 0].numpy()
+        )
         assert (photo.mask is None) == (lens.model == "OPENCV" and not any(lens.distortion))
         assert shown.mean() > 0.9
-        # Bilinear sampling of smooth walls, and rounding to 8 bits twice; edges of walls are few pixels.
+        # Bilinear sampling of smooth walls, and rounding to 8 bits twice; edges of walls are few
+        # pixels.
         assert np.quantile(apart[shown], 0.98) < 2.5 / 255
 
 
 @pytest.mark.parametrize(
     ("model", "distortion"),
     [
-        ("SIMPLE_RADIAL", (0.08,)), ("RADIAL", (-0.2, 0.06)), ("OPENCV", (-0.2, 0.05, 0.01, -0.02)),
+        ("SIMPLE_RADIAL", (0.08,)),
+        ("RADIAL", (-0.2, 0.06)),
+        ("OPENCV", (-0.2, 0.05, 0.01, -0.02)),
         ("FULL_OPENCV", (0.1, -0.05, 0.002, 0.001, 0.02, 0.01, 0.002, 0.001)),
-        ("OPENCV_FISHEYE", (-0.03, 0.01, -0.004, 0.001)), ("SIMPLE_RADIAL_FISHEYE", (0.03,)),
+        ("OPENCV_FISHEYE", (-0.03, 0.01, -0.004, 0.001)),
+        ("SIMPLE_RADIAL_FISHEYE", (0.03,)),
     ],
-)  # fmt: skip
+)
 def test_pixels_lie_where_opencv_says(model, distortion):
     import cv2
 
     K = np.array([[90.0, 0, 60.5], [0, 92.0, 44.0], [0, 0, 1]])
-    from_zero = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's first pixel has its centre at 0
+    from_zero = K - np.array(
+        [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    )  # OpenCV's first pixel has its centre at 0
     lens = lens_of(model, distortion)
     assert lens is not None
     map_of = (cv2.fisheye if lens.fisheye else cv2).initUndistortRectifyMap
     x, y = map_of(from_zero, np.array(lens.params), np.eye(3), from_zero, (120, 90), cv2.CV_32FC1)
     places, shown = pixel_map(lens, torch.tensor(K), 120, 90)
-    expected = torch.stack([torch.from_numpy(x + 0.5) * 2 / 120 - 1, torch.from_numpy(y + 0.5) * 2 / 90 - 1], -1)
+    expected = torch.stack(
+        [torch.from_numpy(x + 0.5) * 2 / 120 - 1, torch.from_numpy(y + 0.5) * 2 / 90 - 1], -1
+    )
     assert float(shown.double().mean()) > 0.8
     assert torch.allclose(places[shown], expected[shown], atol=1e-5)
 
@@ -120,9 +134,15 @@ def test_cameras_that_do_not_fit_a_photo_are_refused(changes, text, tmp_path):
 
 def test_photos_are_reduced_while_read_and_never_enlarged(tmp_path):
     path = saved(np.full((600, 800, 3), (10, 200, 90), np.uint8), tmp_path / "a.jpg", quality=95)
-    shot = camera(4000, 3000, focal=(3000.0, 3000.0), centre=(1990.0, 1510.0))  # the photo is a smaller copy
+    shot = camera(
+        4000, 3000, focal=(3000.0, 3000.0), centre=(1990.0, 1510.0)
+    )  # the photo is a smaller copy
     photo = PhotoReader(tmp_path, 160).read(path, shot)
-    assert photo.image.shape == (120, 160, 3) and photo.image.dtype == torch.uint8 and photo.mask is None
+    assert (
+        photo.image.shape == (120, 160, 3)
+        and photo.image.dtype == torch.uint8
+        and photo.mask is None
+    )
     assert photo.image.float().mean((0, 1)).tolist() == pytest.approx([10, 200, 90], abs=2)
     assert photo.K[:2].flatten().tolist() == pytest.approx([120, 0, 79.6, 0, 120, 60.4])
     assert PhotoReader(tmp_path, 10_000).size(path, shot) == (800, 600)
@@ -131,15 +151,19 @@ def test_photos_are_reduced_while_read_and_never_enlarged(tmp_path):
 @pytest.mark.parametrize("name", ["a.png.png", "a.png", "named.png"])
 def test_masks_count_where_white_and_alpha_is_laid_over_black(name, tmp_path):
     """Beside the folder of photos under their names, or as the cameras name them."""
-    pixels, mask = noise(channels=4), np.zeros((96, 128), np.uint8)
-    pixels[:, :32, 3], pixels[:, 32:, 3] = 0, 255
+    pixels = noise(channels=4)
+    mask = np.zeros((96, 128), np.uint8)
+    pixels[:, :32, 3] = 0
+    pixels[:, 32:, 3] = 255
     mask[:48] = 255
     path = saved(pixels, tmp_path / "images" / "left" / "a.png")
     saved(mask, tmp_path / "masks" / "left" / name)
     reader = PhotoReader(tmp_path, 1000, tmp_path / "images")
     shot = camera(mask="masks/left/named.png" if name == "named.png" else "")
     photo = reader.read(path, shot)
-    assert not photo.image[:, :32].any() and torch.equal(photo.image[:, 32:], torch.from_numpy(pixels[:, 32:, :3]))
+    assert not photo.image[:, :32].any() and torch.equal(
+        photo.image[:, 32:], torch.from_numpy(pixels[:, 32:, :3])
+    )
     assert photo.mask is not None and photo.mask[:24].all() and not photo.mask[24:].any()
     (tmp_path / "masks" / "left" / name).write_bytes(b"no mask")
     with pytest.raises(DataError, match=f"{name}: cannot be read as a mask"):
@@ -151,7 +175,8 @@ def test_a_photo_is_turned_by_exif_where_its_camera_is(tmp_path):
     exif = Image.Exif()
     exif[274] = 6
     path = saved(noise(), tmp_path / "a.png", exif=exif)
-    reader, pixels = PhotoReader(tmp_path, 1000), torch.from_numpy(noise())
+    reader = PhotoReader(tmp_path, 1000)
+    pixels = torch.from_numpy(noise())
     assert torch.equal(reader.read(path, camera(48, 64)).image, pixels.rot90(-1))
     assert torch.equal(reader.read(path, camera()).image, pixels)
 
@@ -159,7 +184,13 @@ def test_a_photo_is_turned_by_exif_where_its_camera_is(tmp_path):
 def png_of(width: int, height: int) -> bytes:
     head = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     data = struct.pack(">I", 1000) + b"IDAT"
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head)) + data
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + struct.pack(">I", 13)
+        + head
+        + struct.pack(">I", zlib.crc32(head))
+        + data
+    )
 
 
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
@@ -180,10 +211,18 @@ def test_photos_that_cannot_be_read_or_are_huge_are_named(content, text, tmp_pat
 @pytest.mark.parametrize(
     ("names", "files", "found"),
     [
-        (["images/a.jpg", "./images/b"], ["a.png", "b.JPG"], ["a.png", "b.JPG"]),  # smaller copies, other suffixes
+        (
+            ["images/a.jpg", "./images/b"],
+            ["a.png", "b.JPG"],
+            ["a.png", "b.JPG"],
+        ),  # smaller copies, other suffixes
         (["left/1.jpg", "right/1.jpg"], ["1.jpg"], [None, None]),  # two cameras would have it
         (["1"], ["left/1.jpg", "right/1.jpg"], [None]),  # it is not known which
-        (["images/1.jpg"], ["images/1.jpg", "depths/1.png"], ["images/1.jpg"]),  # where the file of cameras has it
+        (
+            ["images/1.jpg"],
+            ["images/1.jpg", "depths/1.png"],
+            ["images/1.jpg"],
+        ),  # where the file of cameras has it
         (["../../secret.png", "/etc/a.png", "", "a\0b"], ["b.png"], [None] * 4),
     ],
 )
@@ -191,10 +230,14 @@ def test_each_camera_has_the_photo_of_its_name(names, files, found, tmp_path):
     for file in files:
         saved(noise(), tmp_path / file)
     frames = [{"file_path": name, "transform_matrix": torch.eye(4).tolist()} for name in names]
-    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 50, "w": 64, "h": 48, "frames": frames}))
+    (tmp_path / "transforms.json").write_text(
+        json.dumps({"fl_x": 50, "w": 64, "h": 48, "frames": frames})
+    )
     named = read_named_views(tmp_path / "transforms.json")
     matched = photos_of_cameras(tmp_path, photo_files(tmp_path), named)
-    by_name = {named.names[index]: path.relative_to(tmp_path).as_posix() for index, path in matched.items()}
+    by_name = {
+        named.names[index]: path.relative_to(tmp_path).as_posix() for index, path in matched.items()
+    }
     assert [by_name.get(frame["file_path"]) for frame in frames] == found
 
 

@@ -27,7 +27,9 @@ def rewrite(path, rows, **kwargs):
     PlyData([PlyElement.describe(rows, "vertex")], **kwargs).write(str(path))
 
 
-@pytest.mark.parametrize(("n", "degree"), [(0, 1), (1, 0), (5, 2), (16_384 + 3, 3)])  # the last: two chunks
+@pytest.mark.parametrize(
+    ("n", "degree"), [(0, 1), (1, 0), (5, 2), (16_384 + 3, 3)]
+)  # the last: two chunks
 def test_round_trip_is_exact_to_the_bit(tmp_path, n, degree):
     scene = normal_scene(n, degree)
     write_ply(scene, tmp_path / "a.ply")
@@ -40,18 +42,26 @@ def test_no_infinite_value_is_read_or_written_and_what_is_drawn_stays(tmp_path, 
     scene = normal_scene(8, 0)
     write_ply(scene, tmp_path / "a.ply")
     rows = rows_of(tmp_path / "a.ply")
-    rows["opacity"][:2], rows["scale_1"][2] = (math.inf, -math.inf), -math.inf
-    rows["scale_0"][3], rows["x"][4], rows["f_dc_2"][5], rows["rot_0"][6] = math.inf, math.nan, math.inf, -math.inf
+    rows["opacity"][:2] = (math.inf, -math.inf)
+    rows["scale_1"][2] = -math.inf
+    rows["scale_0"][3] = math.inf
+    rows["x"][4] = math.nan
+    rows["f_dc_2"][5] = math.inf
+    rows["rot_0"][6] = -math.inf
     rewrite(tmp_path / "a.ply", rows)
     found = read_scene(tmp_path / "a.ply")
     assert "dropped 4 of 8" in caplog.text and len(found) == 4
     assert all(bool(value.isfinite().all()) for value in found.tensors())
     assert found.alphas[:2].tolist() == pytest.approx([1.0, 0.0], abs=1e-12)
     assert 0 < float(found.stds[2, 1]) < 1e-37  # float32 has no smaller normal numbers
-    scene.opacities[0], scene.opacities[1], scene.scales[2, 1] = math.inf, -math.inf, -math.inf
+    scene.opacities[0] = math.inf
+    scene.opacities[1] = -math.inf
+    scene.scales[2, 1] = -math.inf
     write_ply(scene, tmp_path / "b.ply")
     written = rows_of(tmp_path / "b.ply")
-    assert all(np.isfinite(written[name]).all() for name in written.dtype.names) and len(written) == 8
+    assert (
+        all(np.isfinite(written[name]).all() for name in written.dtype.names) and len(written) == 8
+    )
 
 
 def test_a_sparse_file_that_would_fill_the_memory_is_refused(tmp_path):
@@ -71,14 +81,17 @@ def test_a_sparse_file_that_would_fill_the_memory_is_refused(tmp_path):
 
 
 def test_what_a_gaussian_has_no_place_for_is_said(tmp_path, caplog):
-    path, scene = tmp_path / "a.ply", normal_scene(5, 1)
+    path = tmp_path / "a.ply"
+    scene = normal_scene(5, 1)
     write_ply(scene, path)
     assert same_bits(scene, read_ply(path)) and not caplog.records
     faces = PlyElement.describe(np.zeros(2, [("area", "f4")]), "face")
     more = {"red": np.zeros(5, "u1"), "class": np.ones(5, "i4")}
     write_columns(path, columns_of(scene) | more, before=[faces])
     assert same_bits(scene, read_ply(path))
-    assert caplog.messages == [f"{path}: not read: the vertex properties red, class; the element 'face'"]
+    assert caplog.messages == [
+        f"{path}: not read: the vertex properties red, class; the element 'face'"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -94,7 +107,9 @@ def test_comments_in_any_encoding_and_later_elements_are_skipped(tmp_path, text,
     scene = normal_scene(5, 0)
     write_ply(scene, tmp_path / "a.ply")
     rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=text, byte_order="<")
-    (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(before, inserted + before, 1))
+    (tmp_path / "b.ply").write_bytes(
+        (tmp_path / "b.ply").read_bytes().replace(before, inserted + before, 1)
+    )
     assert same_bits(scene, read_ply(tmp_path / "b.ply"))
 
 
@@ -117,7 +132,9 @@ def fails(path, *fragments):
 def test_truncated_data_is_said_with_both_counts(tmp_path, cut):
     write_ply(normal_scene(7, 3), tmp_path / "a.ply")
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-cut])
-    fails(tmp_path / "a.ply", "truncated", "declares 7 Gaussians", f"holds {7 - math.ceil(cut / 248)}")
+    fails(
+        tmp_path / "a.ply", "truncated", "declares 7 Gaussians", f"holds {7 - math.ceil(cut / 248)}"
+    )
 
 
 def columns(*without):
@@ -129,24 +146,49 @@ def test_2d_gaussians_are_read_as_flat_ones(tmp_path, caplog):
     found = {name: array for name, array in columns_of(scene).items() if name != "scale_2"}
     flat = read_scene(write_columns(tmp_path / "flat.ply", found))
     assert "2D Gaussians" in caplog.text and "scale_2" in caplog.text
-    assert torch.equal(flat.scales[:, :2], scene.scales[:, :2]) and float(flat.stds[:, 2].max()) < 1e-30
-    assert torch.equal(flat.quats, scene.quats) and torch.equal(flat.features_rest, scene.features_rest)
+    assert (
+        torch.equal(flat.scales[:, :2], scene.scales[:, :2])
+        and float(flat.stds[:, 2].max()) < 1e-30
+    )
+    assert torch.equal(flat.quats, scene.quats) and torch.equal(
+        flat.features_rest, scene.features_rest
+    )
 
 
 @pytest.mark.parametrize(
     ("element", "properties", "fragments"),
     [
         ("vertex", columns("f_rest_7"), ["lacks the vertex property 'f_rest_7'"]),
-        ("vertex", columns("f_rest_44", "f_rest_43"), ["has 43 f_rest properties", "0, 9, 24, 45 or 72"]),
-        ("vertex", [*columns()[:3], ("red", "u1")], ["lacks the vertex property 'f_dc_0' and 10 more"]),
-        ("vertex", [("packed_position", "u4"), ("packed_rotation", "u4")], ["compressed PLY", "expected a plain one"]),
-        ("vertex", [*columns(), ("filter_3D", "f4")], ["expected both fused, as its create_fused_ply.py writes them"]),
+        (
+            "vertex",
+            columns("f_rest_44", "f_rest_43"),
+            ["has 43 f_rest properties", "0, 9, 24, 45 or 72"],
+        ),
+        (
+            "vertex",
+            [*columns()[:3], ("red", "u1")],
+            ["lacks the vertex property 'f_dc_0' and 10 more"],
+        ),
+        (
+            "vertex",
+            [("packed_position", "u4"), ("packed_rotation", "u4")],
+            ["compressed PLY", "expected a plain one"],
+        ),
+        (
+            "vertex",
+            [*columns(), ("filter_3D", "f4")],
+            ["expected both fused, as its create_fused_ply.py writes them"],
+        ),
         ("point", columns()[:1], ["no element 'vertex' (found point)"]),
     ],
     ids=str,
 )
-def test_a_file_without_what_a_gaussian_needs_is_refused_by_what_it_lacks(tmp_path, element, properties, fragments):
-    PlyData([PlyElement.describe(np.zeros(4, properties), element)], byte_order="<").write(str(tmp_path / "a.ply"))
+def test_a_file_without_what_a_gaussian_needs_is_refused_by_what_it_lacks(
+    tmp_path, element, properties, fragments
+):
+    PlyData([PlyElement.describe(np.zeros(4, properties), element)], byte_order="<").write(
+        str(tmp_path / "a.ply")
+    )
     fails(tmp_path / "a.ply", *fragments)
 
 
@@ -173,7 +215,10 @@ def test_an_absurd_count_is_refused_before_memory_is_taken(tmp_path, form, eleme
     [
         ("element vertex -5", "line 3 is not understood: 'element vertex -5'"),
         ("element vertex 1\nproperty quad x", "line 4 is not understood: 'property quad x'"),
-        ("element vertex 1\nproperty float x\nproperty float x", "declares vertex property 'x' twice"),
+        (
+            "element vertex 1\nproperty float x\nproperty float x",
+            "declares vertex property 'x' twice",
+        ),
         ("element vertex 1\nelement vertex 1", "declares element 'vertex' twice"),
         ("element vertex 1\nproperty list uchar int lists", "vertex property 'lists' is a list"),
         (None, "names no format"),
@@ -188,8 +233,14 @@ def test_a_damaged_header_line_is_quoted(tmp_path, line, fragment):
 @pytest.mark.parametrize(
     ("damage", "fragment"),
     [
-        (lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0] + "\n"], "row 2: property 'rot_3': early end-of-line"),
-        (lambda lines: [*lines[:-1], "what " + lines[-1].split(" ", 1)[1]], "row 2: property 'x': malformed input"),
+        (
+            lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0] + "\n"],
+            "row 2: property 'rot_3': early end-of-line",
+        ),
+        (
+            lambda lines: [*lines[:-1], "what " + lines[-1].split(" ", 1)[1]],
+            "row 2: property 'x': malformed input",
+        ),
         (lambda lines: lines[:-1], "row 2: early end-of-file"),
     ],
 )
@@ -220,7 +271,9 @@ def test_every_line_end_and_spaces_after_the_last_keyword_are_read(tmp_path, new
 def test_names_with_prefixes_of_cloudcompare_are_read_to_the_bit(tmp_path, prefix, text, caplog):
     scene = normal_scene(6, 2)
     plain = {"x", "y", "z", "nx", "ny", "nz"}
-    found = {name if name in plain else prefix + name: array for name, array in columns_of(scene).items()}
+    found = {
+        name if name in plain else prefix + name: array for name, array in columns_of(scene).items()
+    }
     # A name that is there with and without a prefix is read without.
     more = {"opacity": found.pop(f"{prefix}opacity"), f"{prefix}opacity": np.zeros(6, np.float32)}
     path = write_columns(tmp_path / "a.ply", {**found, **more, "red": np.zeros(6, "u1")}, text)

@@ -29,16 +29,21 @@ def values(scene: Gaussians) -> torch.Tensor:
     axis = torch.linspace(-1, 1, 61, dtype=torch.float64)
     points = torch.cartesian_prod(axis, axis, axis) - scene.means.double()
     powers = torch.einsum(
-        "pi,ij,pj->p", points, unpack(covariances(scene.scales.double(), scene.quats.double()))[0].inverse(), points
+        "pi,ij,pj->p",
+        points,
+        unpack(covariances(scene.scales.double(), scene.quats.double()))[0].inverse(),
+        points,
     )
     return (-0.5 * powers).exp()
 
 
 @pytest.mark.parametrize(
-    ("name", "change"), [("means", [0.0, 1.0, 0.0]), ("scales", [0.0, 1.0, 0.0]), ("quats", [0.0, 0.0, 0.0, 1.0])]
+    ("name", "change"),
+    [("means", [0.0, 1.0, 0.0]), ("scales", [0.0, 1.0, 0.0]), ("quats", [0.0, 0.0, 0.0, 1.0])],
 )
 def test_a_step_changes_a_gaussian_by_its_tolerance_over_the_contrast(name, change):
-    scene, tolerance = splats(torch.zeros(1, 3), torch.tensor([0.2, 0.1, 0.1]).log(), 0.0), 1e-3
+    scene = splats(torch.zeros(1, 3), torch.tensor([0.2, 0.1, 0.1]).log(), 0.0)
+    tolerance = 1e-3
     steps = {"means": "means", "scales": "log_scales", "quats": "quats"}
     error = getattr(steps_of(scene, tolerance), steps[name]) / math.sqrt(12)
     changed = scene.replace(**{name: getattr(scene, name) + error.float() * torch.tensor([change])})
@@ -49,11 +54,27 @@ def test_a_step_changes_a_gaussian_by_its_tolerance_over_the_contrast(name, chan
 def test_extremes_stay_finite_and_usable():
     scene = cloud(6)
     scene = scene.replace(
-        scales=torch.tensor([[-80.0, 0.0, 0.0], [-80.0] * 3, [60.0, -60.0, 0.0], [0.0] * 3, [5.0] * 3, [-30.0, 9, 9]]),
+        scales=torch.tensor(
+            [
+                [-80.0, 0.0, 0.0],
+                [-80.0] * 3,
+                [60.0, -60.0, 0.0],
+                [0.0] * 3,
+                [5.0] * 3,
+                [-30.0, 9, 9],
+            ]
+        ),
         opacities=torch.tensor([[-80.0], [80.0], [0.0], [20.0], [-20.0], [5.0]]),
         means=scene.means * torch.tensor([[1e-30], [1e9], [1.0], [1e3], [0.0], [1.0]]),
         quats=torch.tensor(
-            [[0.0, 0, 0, 0], [1e-30, 0, 0, 0], [1e18, 1, 0, 0], [1.0, 1, 1, 1], [1, 0, 0, 0], [0, 0, 1, 1]]
+            [
+                [0.0, 0, 0, 0],
+                [1e-30, 0, 0, 0],
+                [1e18, 1, 0, 0],
+                [1.0, 1, 1, 1],
+                [1, 0, 0, 0],
+                [0, 0, 1, 1],
+            ]
         ),
     )
     for suffix in (".spz", ".sog"):
@@ -64,8 +85,10 @@ def test_extremes_stay_finite_and_usable():
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog"])
 def test_files_become_smaller_and_keep_what_was_rounded(suffix, tmp_path):
-    room, kind = ps.example_room()[::20], format_to_write(suffix)
-    sizes, tolerances = [], (0.0, 0.01, 0.04)
+    room = ps.example_room()[::20]
+    kind = format_to_write(suffix)
+    sizes = []
+    tolerances = (0.0, 0.01, 0.04)
     for tolerance in tolerances:
         small = kind.rounded(room, tolerance)
         kind.write(small, tmp_path / f"a{suffix}", SILENT)
@@ -78,7 +101,9 @@ def test_files_become_smaller_and_keep_what_was_rounded(suffix, tmp_path):
 
 def test_rows_of_any_order_and_type_are_read_in_pieces_as_in_whole(tmp_path):
     scene = cloud(50, seed=3, sh_degree=1)
-    columns = {name: column.astype(np.float64) for name, column in reversed(columns_of(scene).items())}
+    columns = {
+        name: column.astype(np.float64) for name, column in reversed(columns_of(scene).items())
+    }
     camera = PlyElement.describe(np.zeros(2, [("id", "u1")]), "camera")
     write_columns(tmp_path / "a.ply", columns, order=">", before=[camera])
     rows = ply.PlyRows.open(tmp_path / "a.ply")
@@ -101,11 +126,17 @@ def test_rows_of_a_file_that_shrinks_are_refused(tmp_path):
 def test_sh_of_few_different_rows_keep_them(different):
     """A palette of twice the entries may then have no error at all."""
     generator = torch.Generator().manual_seed(0)
-    centres = torch.randn(300, 9, generator=generator)[torch.randint(300, (different,), generator=generator)]
+    centres = torch.randn(300, 9, generator=generator)[
+        torch.randint(300, (different,), generator=generator)
+    ]
     rows = centres + 0.01 * torch.randn(different, 9, generator=generator)
     rows = 3 * rows[torch.arange(4000) % different].reshape(4000, 3, 3)
     rounding = rounding_for(30.0, 1)
-    rest = format_to_write(".sog").rounded(cloud(4000, sh_degree=1).replace(features_rest=rows), rounding).features_rest
+    rest = (
+        format_to_write(".sog")
+        .rounded(cloud(4000, sh_degree=1).replace(features_rest=rows), rounding)
+        .features_rest
+    )
     assert 0.95 * different <= len(rest.flatten(1).unique(dim=0)) <= different
     error = float((rest - rows).square().mean().sqrt())
     assert error < ROUNDING.palette_error * rounding / (SH_C0 * 3**0.5)
@@ -121,5 +152,9 @@ def test_codebooks_are_listed_in_few_digits_and_read_back_to_the_bit(tolerance, 
         book, _ = codebook(values)
         listed = torch.tensor(meta[name]["codebook"])
         used = book < book[-1]
-        assert len(listed) == 256 and torch.equal(listed[used], book[used]) and float(book[-1]) in listed
+        assert (
+            len(listed) == 256
+            and torch.equal(listed[used], book[used])
+            and float(book[-1]) in listed
+        )
         assert all(len(repr(number)) <= 16 for number in meta[name]["codebook"])

@@ -17,17 +17,23 @@ from pointsplat_ns.io.formats.sog_stream import Node, read_sog_stream, write_sog
 from pointsplat_ns.io.scene import kind_of
 from pointsplat_ns.io.usable import keep_usable
 
-FINE, COARSE = 300, 60
+FINE = 300
+COARSE = 60
 
 
 @pytest.fixture()
 def folder(tmp_path) -> Path:
     """Two levels in three leaves; of the finer level, the first two fill a file."""
     levels = [normal_scene(FINE, seed=1), normal_scene(COARSE, seed=2)]
-    rows = [(torch.arange(100 * i, 100 * i + 100), torch.arange(20 * i, 20 * i + 20)) for i in range(3)]
+    rows = [
+        (torch.arange(100 * i, 100 * i + 100), torch.arange(20 * i, 20 * i + 20)) for i in range(3)
+    ]
     first, second, third = (Node(rows=leaf) for leaf in rows)
     meta = write_sog_stream(
-        levels, Node(children=(Node(children=(first, second)), third)), tmp_path / "lod-meta.json", 150
+        levels,
+        Node(children=(Node(children=(first, second)), third)),
+        tmp_path / "lod-meta.json",
+        150,
     )
     assert meta["filenames"] == ["0_0/meta.json", "1_0/meta.json", "0_1/meta.json"]
     return tmp_path
@@ -42,15 +48,20 @@ def test_each_level_is_read_whole_the_finest_by_default(folder):
 def test_a_box_holds_one_standard_deviation_of_every_gaussian(folder):
     leaf = json.loads((folder / "lod-meta.json").read_text())["tree"]["children"][1]
     parts = [normal_scene(FINE, seed=1)[200:], normal_scene(COARSE, seed=2)[40:]]
-    low = torch.cat([part.means - part.stds.amin(dim=1, keepdim=True) for part in parts]).amin(dim=0)
-    far = torch.cat([part.means - 3**0.5 * part.stds.amax(dim=1, keepdim=True) for part in parts]).amin(dim=0)
+    low = torch.cat([part.means - part.stds.amin(dim=1, keepdim=True) for part in parts]).amin(
+        dim=0
+    )
+    far = torch.cat(
+        [part.means - 3**0.5 * part.stds.amax(dim=1, keepdim=True) for part in parts]
+    ).amin(dim=0)
     found = torch.tensor(leaf["bound"]["min"])
     assert bool((found <= low + 1e-5).all()) and bool((found >= far - 1e-5).all())
 
 
 def test_an_older_stream_is_replaced_and_nothing_is_left_of_a_failure(folder, monkeypatch):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    scene, leaf = normal_scene(30), Node(rows=(torch.arange(30),))
+    scene = normal_scene(30)
+    leaf = Node(rows=(torch.arange(30),))
     with monkeypatch.context() as patch:
         patch.setattr("pointsplat_ns.io.formats.sog_stream.sog_parts", lambda *a, **k: 1 / 0)
         with pytest.raises(ZeroDivisionError):
@@ -64,26 +75,50 @@ LIES = {
     "another version": ({"version": 2}, "version 1"),
     "no level": ({"lodLevels": 0}, "0 levels"),
     "one name twice": ({"filenames": ["0_0/meta.json"] * 3}, "filenames"),
-    "a file elsewhere": ({"filenames": ["/etc/meta.json", "b/meta.json", "c/meta.json"]}, "own folder"),
-    "an address": ({"filenames": ["https://a.b/meta.json", "b/meta.json", "c/meta.json"]}, "own folder"),
-    "a file of another kind": ({"filenames": ["passwd", "b/meta.json", "c/meta.json"]}, "meta.json or a .sog"),
+    "a file elsewhere": (
+        {"filenames": ["/etc/meta.json", "b/meta.json", "c/meta.json"]},
+        "own folder",
+    ),
+    "an address": (
+        {"filenames": ["https://a.b/meta.json", "b/meta.json", "c/meta.json"]},
+        "own folder",
+    ),
+    "a file of another kind": (
+        {"filenames": ["passwd", "b/meta.json", "c/meta.json"]},
+        "meta.json or a .sog",
+    ),
     "no tree": ({"tree": None}, "node of the tree"),
-    "a file beyond the last": ({"tree": {"lods": {"0": {"file": 3, "offset": 0, "count": 1}}}}, "file 3 of 3"),
-    "rows that are infinite": ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 1e400}}}}, "whole numbers"),
-    "too many rows": ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 201}}}}, "200 Gaussians"),
-    "more than memory holds": ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 10**15}}}}, "memory"),
+    "a file beyond the last": (
+        {"tree": {"lods": {"0": {"file": 3, "offset": 0, "count": 1}}}},
+        "file 3 of 3",
+    ),
+    "rows that are infinite": (
+        {"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 1e400}}}},
+        "whole numbers",
+    ),
+    "too many rows": (
+        {"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 201}}}},
+        "200 Gaussians",
+    ),
+    "more than memory holds": (
+        {"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 10**15}}}},
+        "memory",
+    ),
 }
 
 
 @pytest.mark.parametrize("lie", LIES)
 def test_a_lie_is_one_error(folder, lie):
-    (changes, said), path = LIES[lie], folder / "lod-meta.json"
+    (changes, said) = LIES[lie]
+    path = folder / "lod-meta.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
     fails(lambda: ps.load(path), said, error=ps.SceneError)
 
 
 def test_a_deep_tree_and_a_missing_file_are_one_error(folder):
-    deep = '{"lodLevels":1,"filenames":[],"tree":' + '{"children":[' * 100_000 + "]}" * 100_000 + "}"
+    deep = (
+        '{"lodLevels":1,"filenames":[],"tree":' + '{"children":[' * 100_000 + "]}" * 100_000 + "}"
+    )
     (folder / "0_1" / "quats.webp").unlink()
     fails(lambda: ps.load(folder), "quats.webp", error=ps.SceneError)
     (folder / "lod-meta.json").write_text(deep)
@@ -92,21 +127,44 @@ def test_a_deep_tree_and_a_missing_file_are_one_error(folder):
     fails(lambda: read_sog_stream(folder, 2), "no level 2", error=ps.SceneError)
 
 
-EXTREMES = [0.0, -0.0, 1.0, -1.0, 1e-45, 1e-38, 88.0, -104.0, 8388607.0, 1e20, -3.4e38, 3.4e38, np.inf, -np.inf, np.nan]
+EXTREMES = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    1e-45,
+    1e-38,
+    88.0,
+    -104.0,
+    8388607.0,
+    1e20,
+    -3.4e38,
+    3.4e38,
+    np.inf,
+    -np.inf,
+    np.nan,
+]
 
 NUMBERS = st.one_of(st.sampled_from(EXTREMES), st.floats(-5, 5, width=32))
 
 QUICK = settings(
-    max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=25,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 
 
 @st.composite
 def scenes(draw):
     """Scenes of up to five Gaussians of any degree, in which any number may be extreme."""
-    n, degree = draw(st.integers(0, 5)), draw(st.integers(0, 3))
+    n = draw(st.integers(0, 5))
+    degree = draw(st.integers(0, 3))
     tails = ((3,), (3,), (4,), (1,), (3,), ((degree + 1) ** 2 - 1, 3))
-    tables = (draw(arrays.arrays(np.float64, (n, *tail), elements=NUMBERS)).astype(np.float32) for tail in tails)
+    tables = (
+        draw(arrays.arrays(np.float64, (n, *tail), elements=NUMBERS)).astype(np.float32)
+        for tail in tails
+    )
     return ps.Gaussians(*(torch.from_numpy(table) for table in tables))
 
 
@@ -119,10 +177,16 @@ def test_what_can_be_drawn_of_an_extreme_scene_is_written_and_read_back(tmp_path
     try:
         ps.save(scene, path, overwrite=True)
     except ps.SceneError as error:  # SPZ reaches to 2^23 units
-        assert suffix == ".spz" and float(usable.means.abs().max()) > 2**23 - 1 and "\n" not in str(error)
+        assert (
+            suffix == ".spz"
+            and float(usable.means.abs().max()) > 2**23 - 1
+            and "\n" not in str(error)
+        )
         return
     again = ps.load(path)
-    assert len(again) == len(usable) and all(bool(value.isfinite().all()) for value in again.tensors())
+    assert len(again) == len(usable) and all(
+        bool(value.isfinite().all()) for value in again.tensors()
+    )
     assert suffix != ".ply" or same_bits(again, keep_usable(scene, path))
     ps.save(again, path, overwrite=True)  # what was read is written again
     assert len(ps.load(path)) == len(again)

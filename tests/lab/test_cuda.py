@@ -27,7 +27,10 @@ def test_every_check_passes_where_both_devices_are_the_cpu(coarse_rooms, capsys)
 def test_a_device_fails_that_keeps_another_number_or_loses_more(found, said, capsys):
     assert cuda.passes("prune", lambda: cuda.compared(found)) == (said is None)
     printed = capsys.readouterr().out
-    assert printed.startswith("pass  prune" if said is None else "FAIL  prune") and (said or "dB") in printed
+    assert (
+        printed.startswith("pass  prune" if said is None else "FAIL  prune")
+        and (said or "dB") in printed
+    )
 
 
 def test_checks_that_fail_are_said_and_end_it_with_status_1(monkeypatch, capsys):
@@ -41,4 +44,8 @@ def test_checks_that_fail_are_said_and_end_it_with_status_1(monkeypatch, capsys)
         cuda.main(device="cpu", every=80)
     printed = capsys.readouterr().out
     assert ended.value.code == 1
-    assert "FAIL  golden pictures" in printed and "FAIL  times of torch" in printed and "6 of 8 passed" in printed
+    assert (
+        "FAIL  golden pictures" in printed
+        and "FAIL  times of torch" in printed
+        and "6 of 8 passed" in printed
+    )

@@ -27,7 +27,9 @@ def test_training_brings_repairs_closer(small, tmp_path):
         return float(torch.stack(repairs).mean())
 
     shares: list[float] = []
-    network = train_feedback([small], 25, at_once=1, output=tmp_path / "a.safetensors", progress=shares.append)
+    network = train_feedback(
+        [small], 25, at_once=1, output=tmp_path / "a.safetensors", progress=shares.append
+    )
     assert shares[-1] == 1 and len(shares) == 25
     assert reached(network) > reached(FeedbackRefiner()) + 0.05
     saved = read_feedback_refiner(tmp_path / "a.safetensors")

@@ -1,4 +1,5 @@
-"""Files that fuzzing found to reach new branches: each is read, or refused by one typed error in one line."""
+"""Files that fuzzing found to reach new branches: each is read, or refused by one typed error in
+one line."""
 
 import logging
 from contextlib import suppress

@@ -1,4 +1,5 @@
-"""lab/judge: the camera paths that ship, what programs measure in their views, and rows that are kept."""
+"""lab/judge: the camera paths that ship, what programs measure in their views, and rows that are
+kept."""
 
 import dataclasses
 import json
@@ -40,15 +41,21 @@ def rows_of(results: Path) -> list[dict]:
     return json.loads(results.read_text())["rows"]
 
 
-@pytest.mark.parametrize("path", sorted(camera_paths.FOLDER.glob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted(camera_paths.FOLDER.glob("*.json")), ids=lambda path: path.stem
+)
 def test_a_path_that_ships_has_sixteen_upright_views_from_different_places(path):
-    found, views = camera_paths.read_path(path), camera_paths.views_of(path, 320)
+    found = camera_paths.read_path(path)
+    views = camera_paths.views_of(path, 320)
     assert len(views) == 16 and 60 <= found.field_of_view <= 70
     assert len({tuple(eye) for eye in torch.cat([found.eyes, found.ats], 1).tolist()}) == 16
     up = found.up / found.up.norm()
-    right, down = views.viewmats[:, 0, :3], views.viewmats[:, 1, :3]
+    right = views.viewmats[:, 0, :3]
+    down = views.viewmats[:, 1, :3]
     assert (right @ up).abs().max() < 1e-12  # the horizon is level
-    assert (down @ up).max() < -0.3  # and up is up: no view looks down or up by more than about 70 degrees
+    assert (
+        down @ up
+    ).max() < -0.3  # and up is up: no view looks down or up by more than about 70 degrees
 
 
 def test_every_way_has_a_row_for_each_width(small, tmp_path, capsys):
@@ -58,18 +65,36 @@ def test_every_way_has_a_row_for_each_width(small, tmp_path, capsys):
     said = capsys.readouterr().out
     content = json.loads(results.read_text())
     labels = ["prune", "splat-transform 3.7.0 -d", "splat-transform 3.7.0 adaptive"]
-    assert [(row["at"], row["method"]) for row in content["rows"]] == [(at, m) for at in (32, 64) for m in labels]
+    assert [(row["at"], row["method"]) for row in content["rows"]] == [
+        (at, m) for at in (32, 64) for m in labels
+    ]
     for row in content["rows"]:
         assert (row["gaussians"], row["count"], row["views"], row["failed"]) == (900, 450, 2, "")
         assert row["peak_bytes"] > 5e6 and row["seconds"] > 0 and row["cpu_seconds"] > 0
         assert 0 < row["covered_psnr"] < 100 and 0 < row["dense_ssim"] < 1
-    assert said.count("covered PSNR") == 1 and " ".join(said.split()).count("splat-transform 3.7.0 adaptive") >= 1
-    assert {path.name for path in tmp_path.iterdir()} == {"small.ply", "small.json", "rows.json", "peer-3.7.0"}
+    assert (
+        said.count("covered PSNR") == 1
+        and " ".join(said.split()).count("splat-transform 3.7.0 adaptive") >= 1
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "small.ply",
+        "small.json",
+        "rows.json",
+        "peer-3.7.0",
+    }
 
 
 def test_a_way_that_fails_is_noted_and_measured_again(small, tmp_path, capsys):
-    results, broken = tmp_path / "rows.json", peer(tmp_path, "2.0.0", fails="--decimate")
-    options = {"keep": (0.5,), "ways": (), "widths": (32,), "views": 1, "lpips": False, "json_path": results}
+    results = tmp_path / "rows.json"
+    broken = peer(tmp_path, "2.0.0", fails="--decimate")
+    options = {
+        "keep": (0.5,),
+        "ways": (),
+        "widths": (32,),
+        "views": 1,
+        "lpips": False,
+        "json_path": results,
+    }
     judge.main((small,), **options, splat_transform=(broken, peer(tmp_path, "2.7.1")))
     said = capsys.readouterr().out
     failed, fine = rows_of(results)
@@ -94,11 +119,21 @@ def test_a_run_is_judged_by_its_held_out_photos_in_their_size(trained_walls, tmp
 
 def test_means_and_leads_are_over_scenes_that_have_every_way():
     rows = [
-        {"scene": scene, "keep": 0.1, "method": method, "at": 960, "failed": "", "cpu_seconds": 1.0, "peak_bytes": 1e9}
+        {
+            "scene": scene,
+            "keep": 0.1,
+            "method": method,
+            "at": 960,
+            "failed": "",
+            "cpu_seconds": 1.0,
+            "peak_bytes": 1e9,
+        }
         | dict.fromkeys(scenes.MEASURES)
         | {"covered_psnr": psnr}
         for scene, *psnrs in (("rock", 25, 27, 24, 23), ("chair", 30, 31, 26, 28), ("can", 40, 41))
-        for method, psnr in zip(("prune", "compact", "splat-transform 3 -d", "splat-transform 2"), psnrs, strict=False)
+        for method, psnr in zip(
+            ("prune", "compact", "splat-transform 3 -d", "splat-transform 2"), psnrs, strict=False
+        )
     ]
     figures = record.Figures(rows)
     text = record.section(figures, 960)
@@ -106,16 +141,30 @@ def test_means_and_leads_are_over_scenes_that_have_every_way():
     assert figures.scenes(960) == "2" and row in text
 
 
-def test_levels_of_a_stream_are_judged_beside_programs_at_their_counts(small, tmp_path, monkeypatch, capsys):
+def test_levels_of_a_stream_are_judged_beside_programs_at_their_counts(
+    small, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(large, "WIDTHS", (32, 64))
-    ps.lod(small, ["100%", "40%", "20%"], folder=tmp_path / "stream", stream=True, resolution=(64, 48))
-    results, programs = tmp_path / "l.json", dict(ways=("prune",), splat_transform=peer(tmp_path, "3.0"))
+    ps.lod(
+        small, ["100%", "40%", "20%"], folder=tmp_path / "stream", stream=True, resolution=(64, 48)
+    )
+    results = tmp_path / "l.json"
+    programs = dict(ways=("prune",), splat_transform=peer(tmp_path, "3.0"))
     for counts in ((360,), ()):  # what is there is not measured again
-        large.main(tmp_path / "stream/lod-meta.json", "small", counts, json_path=results, resume=True, **programs)
+        large.main(
+            tmp_path / "stream/lod-meta.json",
+            "small",
+            counts,
+            json_path=results,
+            resume=True,
+            **programs,
+        )
     rows = rows_of(results)
     found = sorted((row["way"][:5], row["count"]) for row in rows)
     assert found == [(way, count) for way in ("prune", "publi", "splat") for count in (180, 360)]
-    assert all(row["worst_64"] < row["mean_64"] < 60 and row["kept"] == row["count"] for row in rows)
+    assert all(
+        row["worst_64"] < row["mean_64"] < 60 and row["kept"] == row["count"] for row in rows
+    )
     assert "900 Gaussians" in (said := capsys.readouterr().out) and "| 1.00 |" in said
 
 
@@ -128,8 +177,12 @@ def test_a_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, t
     rows = rows_of(results)
     assert [row["method"] for row in rows] == ["default", *TWO]
     scene = scenes.load(small, (64,), 2)
-    for row, changes in zip(rows, ({}, {"regrouping_rounds": 0}, {"growth_exponent": 0.0}), strict=True):
-        merged = merge(read_scene(small), 180, settings=dataclasses.replace(MERGING, **changes)).scene
+    for row, changes in zip(
+        rows, ({}, {"regrouping_rounds": 0}, {"growth_exponent": 0.0}), strict=True
+    ):
+        merged = merge(
+            read_scene(small), 180, settings=dataclasses.replace(MERGING, **changes)
+        ).scene
         [(_, _, expected)] = scenes.losses(scene, [merged], None)
         assert row["covered_psnr"] == expected["covered_psnr"]
         assert (row["at"], row["keep"], row["gaussians"], row["changes"]) == (64, 0.2, 900, changes)
@@ -165,7 +218,8 @@ def test_each_strength_is_measured_in_held_out_photos(trained_walls, capsys):
 
 
 def run_here(args: list[str]) -> Usage:
-    """Run in this process what would import torch in one of its own: our command, and splat-transform's conversion."""
+    """Run in this process what would import torch in one of its own: our command, and
+    splat-transform's conversion."""
     if args[1] == "-c":
         main(args[3:])
     elif len(args) == 6:
@@ -181,15 +235,24 @@ def test_files_of_equal_sizes_are_compared_and_drawn(small, tmp_path, monkeypatc
 
     def measure(**options: object) -> list[dict]:
         equal_bytes.main(
-            (small,), (0.008,), ("prune .spz", "splat-transform .spz"), peer(tmp_path, "3.7.0"),
-            width=48, json_path=found, **options,
-        )  # fmt: skip
+            (small,),
+            (0.008,),
+            ("prune .spz", "splat-transform .spz"),
+            peer(tmp_path, "3.7.0"),
+            width=48,
+            json_path=found,
+            **options,
+        )
         return rows_of(found)
 
     rows = measure(picture=tmp_path / "found.png")
     assert (tmp_path / "found.png").read_bytes().startswith(b"\x89PNG")
     ours, peers = rows
-    assert 7200 <= ours["bytes"] <= 8000 and 7700 <= peers["bytes"] <= 8000 and ours["count"] > peers["count"]
+    assert (
+        7200 <= ours["bytes"] <= 8000
+        and 7700 <= peers["bytes"] <= 8000
+        and ours["count"] > peers["count"]
+    )
     [[lead]] = equal_bytes.leads(rows).to_numpy()
     assert lead == pytest.approx(ours["covered_psnr"] - peers["covered_psnr"])
     assert f"{lead:+.1f} small" in capsys.readouterr().out

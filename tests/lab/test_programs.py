@@ -7,7 +7,8 @@ import pytest
 
 from lab.common.programs import ProgramFailed, run_measured
 
-PARENT, CHILD = 2**29, 100_000_000
+PARENT = 2**29
+CHILD = 100_000_000
 """Bytes held by the process that measures, and by the one that is measured."""
 
 
@@ -27,7 +28,10 @@ def test_peak_memory_is_the_childs_own_and_not_its_parents():
 @pytest.mark.parametrize(
     "command, said",
     [
-        (python("import sys; sys.exit('no\\nsuch\\nscene')"), "ended with status 1: no such scene$"),
+        (
+            python("import sys; sys.exit('no\\nsuch\\nscene')"),
+            "ended with status 1: no such scene$",
+        ),
         (python("import os; os.kill(os.getpid(), 9)"), "was killed by signal 9"),
         (["/no/such/program"], "/no/such/program.*FileNotFoundError|No such file"),
     ],
@@ -40,7 +44,11 @@ def test_a_program_that_fails_is_an_error_with_what_it_said_in_one_line(command,
 
 def test_a_program_that_takes_too_long_is_killed_with_all_that_it_started(tmp_path):
     def running() -> list[psutil.Process]:
-        return [p for p in psutil.process_iter(["cmdline"]) if str(tmp_path) in (p.info["cmdline"] or ())]
+        return [
+            p
+            for p in psutil.process_iter(["cmdline"])
+            if str(tmp_path) in (p.info["cmdline"] or ())
+        ]
 
     with pytest.raises(ProgramFailed, match="took more than 2 s and was ended"):
         run_measured([*python("import time; time.sleep(600)"), str(tmp_path)], timeout=2.0)

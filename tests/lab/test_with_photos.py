@@ -1,4 +1,5 @@
-"""lab/training/with_photos.py: which ways are measured, for how long each, and what the record says."""
+"""lab/training/with_photos.py: which ways are measured, for how long each, and what the record
+says."""
 
 import time
 

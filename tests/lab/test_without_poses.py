@@ -1,4 +1,5 @@
-"""lab/judge/captures.py makes captures ready to train; lab/judge/without_poses.py measures what poses are worth."""
+"""lab/judge/captures.py makes captures ready to train; lab/judge/without_poses.py measures what
+poses are worth."""
 
 import dataclasses
 import json
@@ -18,7 +19,9 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 
-KNOWN = captures.Capture("owner/name", "0" * 40, "images", "transforms.json", FRAMES, (WIDTH, HEIGHT), "room", "walls")
+KNOWN = captures.Capture(
+    "owner/name", "0" * 40, "images", "transforms.json", FRAMES, (WIDTH, HEIGHT), "room", "walls"
+)
 BENT = Lens(distortion=(0.12, -0.03, 0.002, -0.001))
 
 
@@ -45,7 +48,9 @@ def test_poses_of_a_json_have_opengl_axes_and_scaled_intrinsics(opencv, tmp_path
     for frame, pose in zip(frames, made.poses, strict=True):
         assert np.allclose(frame["transform_matrix"], pose)
         assert (frame["w"], frame["h"]) == (WIDTH // 2, HEIGHT // 2)
-        assert np.allclose([frame["fl_x"], frame["fl_y"], frame["cx"], frame["cy"]], [22.5, 23.0, 15.5, 12.25])
+        assert np.allclose(
+            [frame["fl_x"], frame["fl_y"], frame["cx"], frame["cy"]], [22.5, 23.0, 15.5, 12.25]
+        )
 
 
 def test_photos_of_a_colmap_model_become_pinhole_pictures(tmp_path):
@@ -78,7 +83,8 @@ def test_every_way_and_set_of_views_has_a_row(trained_walls, tmp_path):
     rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
     ways = [(row["method"], row["views"]) for row in rows]
     assert ways == [(way, name) for way in ("prune", "compact") for name in without_poses.SETS]
-    scene, poses = load(run, (), 2), dataset_views(run, "train")
+    scene = load(run, (), 2)
+    poses = dataset_views(run, "train")
     for row in rows[:3]:
         given = {"sampled": None, "all": poses, "third": poses[::3]}[row["views"]]
         [(_, _, expected)] = losses(scene, [ps.prune(scene.dense, row["count"], views=given)], None)

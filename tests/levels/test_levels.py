@@ -22,7 +22,8 @@ ASKED = ("50%", "25%", "10%", "3%")
 
 @pytest.fixture(scope="module")
 def scene() -> ps.Gaussians:
-    """A ball of which one Gaussian in ten is too faint to be drawn. Shared, so do not write to it."""
+    """A ball of which one Gaussian in ten is too faint to be drawn. Shared, so do not write to
+    it."""
     scene = ball(400, opacity=1.0, bright=1.0)
     scene.opacities[::10] = -9.0
     return scene
@@ -75,7 +76,13 @@ def test_levels_after_an_interrupted_repair_are_only_merged(scene, levels, views
             raise KeyboardInterrupt
 
     made = ps.lod(scene, ["100%", *ASKED], views=views, effort="quick", progress=report)
-    assert made.interrupted and [level.repair is not None for level in made] == [False, True, False, False, False]
+    assert made.interrupted and [level.repair is not None for level in made] == [
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
     assert all(map(same, made.scenes[2:], levels.scenes[1:]))
 
 
@@ -93,7 +100,10 @@ def test_the_manifest_is_true_of_the_files(folder, scene, views):
     named = {"lod.json"}
     for level, count in zip(manifest["levels"], (200, 100, 40, 12), strict=True):
         content = (folder / level["file"]).read_bytes()
-        assert (level["bytes"], level["sha256"]) == (len(content), hashlib.sha256(content).hexdigest())
+        assert (level["bytes"], level["sha256"]) == (
+            len(content),
+            hashlib.sha256(content).hexdigest(),
+        )
         named.add(level["file"])
         read = ps.load(folder / level["file"])
         assert (len(read), read.sh_degree) == (level["count"], level["sh_degree"]) == (count, 1)
@@ -107,7 +117,10 @@ def test_the_manifest_is_true_of_the_files(folder, scene, views):
     corners = {"min": scene.means.amin(dim=0).tolist(), "max": scene.means.amax(dim=0).tolist()}
     assert manifest["bounds"]["all"] == corners
     content = manifest["bounds"]["content"]
-    inside = ((scene.means >= torch.tensor(content["min"])) & (scene.means <= torch.tensor(content["max"]))).double()
+    inside = (
+        (scene.means >= torch.tensor(content["min"]))
+        & (scene.means <= torch.tensor(content["max"]))
+    ).double()
     assert all(0.85 < share < 0.95 for share in inside.mean(dim=0).tolist())
 
 
@@ -117,7 +130,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("where", [(Judge, "quality"), (level_folder, "write_ply")])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
-def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(where, error, scene, views, tmp_path, monkeypatch):
+def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(
+    where, error, scene, views, tmp_path, monkeypatch
+):
     def failing(*_, **__):
         raise error("now")
 
@@ -134,15 +149,22 @@ def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(where, error, scen
 def test_existing_files_are_only_overwritten_by_force(taken, scene, levels, tmp_path):
     (tmp_path / "other.txt").write_text("mine")
     (tmp_path / taken).write_text("precious")
-    for refused in (lambda: ps.lod("not_there.ply", ASKED, folder=tmp_path), lambda: levels.save(tmp_path)):
-        with pytest.raises(ps.SceneError, match=f"{taken}: exists already; name another folder, or .* --force"):
+    for refused in (
+        lambda: ps.lod("not_there.ply", ASKED, folder=tmp_path),
+        lambda: levels.save(tmp_path),
+    ):
+        with pytest.raises(
+            ps.SceneError, match=f"{taken}: exists already; name another folder, or .* --force"
+        ):
             refused()
     assert {name: text.decode() for name, text in contents(tmp_path).items()} == {
         "other.txt": "mine",
         taken: "precious",
     }
     levels.save(tmp_path, force=True)
-    assert (tmp_path / taken).read_bytes() != b"precious" and (tmp_path / "other.txt").read_text() == "mine"
+    assert (tmp_path / taken).read_bytes() != b"precious" and (
+        tmp_path / "other.txt"
+    ).read_text() == "mine"
 
 
 @pytest.mark.parametrize(
@@ -196,10 +218,15 @@ def test_pointsplat_lod_writes_what_lod_gives_bit_for_bit(arguments, options, pl
     [
         (("--levels", "50%", "200"), "levels 50% and 200 both mean 200 of 400 Gaussians"),
         (("--levels", "auto:35"), "level auto:35: expected a ratio"),
-        (("-o", "levels.ply"), "levels.ply: levels are several files; expected the name of a folder"),
+        (
+            ("-o", "levels.ply"),
+            "levels.ply: levels are several files; expected the name of a folder",
+        ),
     ],
 )
-def test_what_cannot_be_done_is_refused_in_one_line_and_writes_nothing(arguments, message, ply, tmp_path, capsys):
+def test_what_cannot_be_done_is_refused_in_one_line_and_writes_nothing(
+    arguments, message, ply, tmp_path, capsys
+):
     assert message in refusal(capsys, tmp_path, "lod", ply, *arguments)
 
 
@@ -209,7 +236,9 @@ def three_levels(scene, views) -> ps.Levels:
 
 
 def leaves_of(node: Node) -> list[Node]:
-    return [leaf for child in node.children for leaf in leaves_of(child)] if node.children else [node]
+    return (
+        [leaf for child in node.children for leaf in leaves_of(child)] if node.children else [node]
+    )
 
 
 def test_each_gaussian_that_is_drawn_is_in_one_leaf_with_its_parent(three_levels):
@@ -222,17 +251,25 @@ def test_each_gaussian_that_is_drawn_is_in_one_leaf_with_its_parent(three_levels
         assert torch.equal(rows.sort().values, kept)
     for leaf in leaves:
         for finer, coarser, of in zip(leaf.rows, leaf.rows[1:], parents, strict=False):
-            assert set(of[finer].tolist()) == set(coarser.tolist()), "no gap and nothing twice between levels"
-    largest = int(torch.bincount(parents[1][parents[0][parents[0] >= 0]]).max())  # one family is not cut
+            assert set(of[finer].tolist()) == set(coarser.tolist()), (
+                "no gap and nothing twice between levels"
+            )
+    largest = int(
+        torch.bincount(parents[1][parents[0][parents[0] >= 0]]).max()
+    )  # one family is not cut
     assert max(len(leaf.rows[0]) for leaf in leaves) <= max(100, largest)
     assert len(leaves_of(partition(three_levels.scenes, parents, 400))) == 1
 
 
 def test_wide_leaves_of_many_gaussians_are_cut(three_levels):
-    leaves = leaves_of(partition(three_levels.scenes, three_levels.parents, 400, extent=0.5, least=40))
+    leaves = leaves_of(
+        partition(three_levels.scenes, three_levels.parents, 400, extent=0.5, least=40)
+    )
     for leaf in leaves:
         means = three_levels[-1].scene.means[leaf.rows[-1]]
-        assert len(leaf.rows[0]) <= 40 or float((means.amax(dim=0) - means.amin(dim=0)).max()) <= 0.5
+        assert (
+            len(leaf.rows[0]) <= 40 or float((means.amax(dim=0) - means.amin(dim=0)).max()) <= 0.5
+        )
     assert len(leaves) > 3
 
 

@@ -1,4 +1,5 @@
-"""3D Tiles are read back by a reader of their own: every Gaussian once, each tile replaced by its children."""
+"""3D Tiles are read back by a reader of their own: every Gaussian once, each tile replaced by its
+children."""
 
 import gzip
 import json
@@ -26,7 +27,8 @@ TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
 def read_tile(path: Path) -> dict[str, np.ndarray]:
-    """The numbers of a tile: positions (N, 3) in the frame of its tileset's root, and bytes of the others."""
+    """The numbers of a tile: positions (N, 3) in the frame of its tileset's root, and bytes of the
+    others."""
     data = path.read_bytes()
     magic, version, size, length, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON") and length % 4 == 0
@@ -34,7 +36,9 @@ def read_tile(path: Path) -> dict[str, np.ndarray]:
     binary, kind = struct.unpack_from("<I4s", data, 20 + length)
     assert kind == b"BIN\0" and 28 + length + binary == size and binary % 4 == 0
     (primitive,) = content["meshes"][0]["primitives"]
-    view = primitive["extensions"]["KHR_gaussian_splatting"]["extensions"]["KHR_gaussian_splatting_compression_spz_2"]
+    view = primitive["extensions"]["KHR_gaussian_splatting"]["extensions"][
+        "KHR_gaussian_splatting_compression_spz_2"
+    ]
     assert view["bufferView"] == 0 and len(content["extensionsRequired"]) == 2
     length_of_spz = content["bufferViews"][0]["byteLength"]
     spz = gzip.decompress(data[28 + length : 28 + length + length_of_spz])
@@ -42,10 +46,16 @@ def read_tile(path: Path) -> dict[str, np.ndarray]:
     assert (magic, version) == (b"NGSP", 3)
     coefficients = 3 * ((degree + 1) ** 2 - 1)
     names = [f"SH_DEGREE_{d}_COEF_{i}" for d in range(1, degree + 1) for i in range(2 * d + 1)]
-    wanted = {"POSITION", "COLOR_0", *(f"KHR_gaussian_splatting:{name}" for name in ("SCALE", "ROTATION", *names))}
+    wanted = {
+        "POSITION",
+        "COLOR_0",
+        *(f"KHR_gaussian_splatting:{name}" for name in ("SCALE", "ROTATION", *names)),
+    }
     assert primitive["attributes"].keys() == wanted
     assert {accessor["count"] for accessor in content["accessors"]} == {count}
-    parts = np.split(np.frombuffer(spz, np.uint8, offset=16), np.cumsum([9 * count, count, 3 * count, 3 * count]))
+    parts = np.split(
+        np.frombuffer(spz, np.uint8, offset=16), np.cumsum([9 * count, count, 3 * count, 3 * count])
+    )
     assert len(parts[4]) == (4 + coefficients) * count
     three = parts[0].reshape(count, 3, 3).astype(np.int64) @ [1, 1 << 8, 1 << 16]
     local = np.where(three >= 1 << 23, three - (1 << 24), three) / 2.0**bits
@@ -61,7 +71,8 @@ def read_tile(path: Path) -> dict[str, np.ndarray]:
 def tiles_of(folder: Path) -> tuple[dict, list[tuple[dict, dict | None]]]:
     """The tileset, and every tile with content beside the one above."""
     tileset = json.loads((folder / "tileset.json").read_text())
-    found, waiting = [], [(tileset["root"], None)]
+    found = []
+    waiting = [(tileset["root"], None)]
     while waiting:
         tile, above = waiting.pop()
         if "content" in tile:
@@ -71,7 +82,8 @@ def tiles_of(folder: Path) -> tuple[dict, list[tuple[dict, dict | None]]]:
 
 
 @pytest.mark.parametrize(
-    ("counts", "degree"), [((1,), 0), ((1, 1), 3), ((40,), 1), ((700, 60, 9), 2), ((900, 300, 100, 5), 3)]
+    ("counts", "degree"),
+    [((1,), 0), ((1, 1), 3), ((40,), 1), ((700, 60, 9), 2), ((900, 300, 100, 5), 3)],
 )
 def test_tiles_hold_each_level_once_and_children_replace_a_tile(counts, degree, tmp_path):
     levels, parents = nested(counts, degree)
@@ -83,38 +95,61 @@ def test_tiles_hold_each_level_once_and_children_replace_a_tile(counts, degree, 
         uri = tile["content"]["uri"]
         level = int(Path(uri).name.split("_")[0])
         content = read_tile(tmp_path / uri)
-        rows[uri] = level, rows_of(torch.from_numpy(content["positions"]), levels[level], float(content["step"]))
+        rows[uri] = (
+            level,
+            rows_of(torch.from_numpy(content["positions"]), levels[level], float(content["step"])),
+        )
         part = levels[level][rows[uri][1]]
         assert np.abs(content["alphas"] - part.alphas.numpy()).max() <= 0.5 / 255 + 1e-6
         assert np.abs(content["scales"] - part.scales.numpy()).max() <= 0.5 / 16 + 1e-6
         box = np.array(tile["boundingVolume"]["box"])
-        assert (np.abs(part.means.numpy() - box[:3]) <= box[3::4]).all(), "the box holds its Gaussians"
+        assert (np.abs(part.means.numpy() - box[:3]) <= box[3::4]).all(), (
+            "the box holds its Gaussians"
+        )
     for level, scene in enumerate(levels):
         all_rows = sorted(row for of, some in rows.values() for row in some if of == level)
-        kept = set(range(len(scene))) - ({*range(8, len(scene), 9)} if level == 0 and parents else set())
+        kept = set(range(len(scene))) - (
+            {*range(8, len(scene), 9)} if level == 0 and parents else set()
+        )
         assert all_rows == sorted(kept) and written[level] == len(kept)
     for tile, _ in tiles:
         level, some = rows[tile["content"]["uri"]]
         children = [rows[child["content"]["uri"]][1] for child in tile.get("children", [])]
-        assert bool(children) == (level > 0) and tile["geometricError"] == (16 * sizes[level] if children else 0)
+        assert bool(children) == (level > 0) and tile["geometricError"] == (
+            16 * sizes[level] if children else 0
+        )
         if children:
             finer = {row for child in children for row in child}
-            assert finer == {row for row, parent in enumerate(parents[level - 1].tolist()) if parent in set(some)}
-        assert all(len(child) <= 64 or len({int(parents[level - 1][row]) for row in child}) == 1 for child in children)
+            assert finer == {
+                row for row, parent in enumerate(parents[level - 1].tolist()) if parent in set(some)
+            }
+        assert all(
+            len(child) <= 64 or len({int(parents[level - 1][row]) for row in child}) == 1
+            for child in children
+        )
 
 
 def test_a_tileset_says_what_viewers_ask_for(tmp_path):
     levels, parents = nested((700, 60), 1)
-    matrix = torch.tensor([[0.0, -1, 0, 5e6], [1, 0, 0, 7], [0, 0, 1, -3], [0, 0, 0, 1]], dtype=torch.float64)
+    matrix = torch.tensor(
+        [[0.0, -1, 0, 5e6], [1, 0, 0, 7], [0, 0, 1, -3], [0, 0, 0, 1]], dtype=torch.float64
+    )
     write_tiles(tmp_path, levels, parents, [0.5, 0.25], matrix, most=100)
     tileset, tiles = tiles_of(tmp_path)
     needed = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
-    assert tileset["asset"]["version"] == "1.1" and tileset["extensionsUsed"] == ["3DTILES_content_gltf"]
-    assert tileset["extensions"]["3DTILES_content_gltf"] == {"extensionsUsed": needed, "extensionsRequired": needed}
+    assert tileset["asset"]["version"] == "1.1" and tileset["extensionsUsed"] == [
+        "3DTILES_content_gltf"
+    ]
+    assert tileset["extensions"]["3DTILES_content_gltf"] == {
+        "extensionsUsed": needed,
+        "extensionsRequired": needed,
+    }
     assert tileset["root"]["refine"] == "REPLACE"
     assert tileset["root"]["transform"] == matrix.T.flatten().tolist()
     assert all(above["geometricError"] >= tile["geometricError"] for tile, above in tiles)
-    assert {tile["geometricError"] for tile, _ in tiles} == {8.0, 0.0}, "a coarser level has no smaller error"
+    assert {tile["geometricError"] for tile, _ in tiles} == {8.0, 0.0}, (
+        "a coarser level has no smaller error"
+    )
     for tile, above in tiles:
         inner, outer = (np.array(of["boundingVolume"]["box"]) for of in (tile, above))
         assert (np.abs(inner[:3] - outer[:3]) + inner[3::4] <= outer[3::4] + 1e-12).all()
@@ -136,24 +171,39 @@ def test_tiles_lie_where_the_scene_does(at, offset, up, tmp_path):
     ps.lod(scene, ["100%", "10%"], views=views, folder=tmp_path / "out", tiles=True, at=at)
     tileset, tiles = tiles_of(tmp_path / "out")
     matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T
-    paths = [tmp_path / "out" / tile["content"]["uri"] for tile, _ in tiles if tile["geometricError"] == 0]
+    paths = [
+        tmp_path / "out" / tile["content"]["uri"]
+        for tile, _ in tiles
+        if tile["geometricError"] == 0
+    ]
     contents = [read_tile(path) for path in paths]
-    found = torch.from_numpy(np.concatenate([part["positions"] for part in contents]) @ matrix[:3, :3].T)
+    found = torch.from_numpy(
+        np.concatenate([part["positions"] for part in contents]) @ matrix[:3, :3].T
+    )
     found += torch.from_numpy(matrix[:3, 3])
     means = scene.means.double()
-    turns = {None: torch.eye(3), "z": torch.eye(3), "-y": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+    turns = {
+        None: torch.eye(3),
+        "z": torch.eye(3),
+        "-y": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    }
     if at is None:
         wanted = means + torch.tensor(offset or (0.0, 0.0, 0.0), dtype=torch.float64)
     elif at.startswith("EPSG"):
-        about = Place.parse(at).frame(torch.tensor(offset, dtype=torch.float64), torch.eye(3).double())
+        about = Place.parse(at).frame(
+            torch.tensor(offset, dtype=torch.float64), torch.eye(3).double()
+        )
         wanted = means @ about[:3, :3].T + about[:3, 3]
     else:
         about = Place.parse(at).frame(torch.zeros(3, dtype=torch.float64), turns[up].double())
         wanted = means @ about[:3, :3].T + about[:3, 3]
-    # A zone's scale is 0.9996 in its middle, and heights have none: 2 units of height differ by 0.0008.
+    # A zone's scale is 0.9996 in its middle, and heights have none: 2 units of height differ by
+    # 0.0008.
     most = float(contents[0]["step"]) + (1e-3 if at and at.startswith("EPSG") else 1e-6)
     middle = wanted.mean(0)
-    apart = torch.cdist(found - middle, wanted - middle, compute_mode="donot_use_mm_for_euclid_dist")
+    apart = torch.cdist(
+        found - middle, wanted - middle, compute_mode="donot_use_mm_for_euclid_dist"
+    )
     assert len(found) == 300 and float(apart.min(dim=1).values.max()) <= most
     assert float(apart.min(dim=0).values.max()) <= most
 
@@ -180,7 +230,9 @@ def test_older_tiles_need_force_and_stay_when_writing_fails(tmp_path, monkeypatc
 
 def test_levels_without_views_have_the_errors_of_their_sizes(tmp_path):
     scene = ball(300, opacity=1.0, bright=1.0)
-    made = replace(ps.lod(scene, ["100%", "10%"], views=ps.sample_views(scene, 2, 48, 36)), views=None)
+    made = replace(
+        ps.lod(scene, ["100%", "10%"], views=ps.sample_views(scene, 2, 48, 36)), views=None
+    )
     LevelOutput(tmp_path, "tiles", None, None, force=False).write(made, silent)
     _, tiles = tiles_of(tmp_path)
     wanted = 16 * float(made[1].scene.stds.median(dim=1).values.median())
@@ -199,5 +251,7 @@ def test_levels_without_views_have_the_errors_of_their_sizes(tmp_path):
     ],
 )
 def test_a_pixel_is_as_large_as_where_a_level_shows_enough(psnr, dense, factor):
-    found = pixel_size_for({1 << step: value for step, value in enumerate(psnr)}, dense, 0.01) / 0.01
+    found = (
+        pixel_size_for({1 << step: value for step, value in enumerate(psnr)}, dense, 0.01) / 0.01
+    )
     assert found == pytest.approx(factor) if factor else 1 / 8 <= found < 2

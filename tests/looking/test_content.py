@@ -22,7 +22,10 @@ def test_content_at_one_position_is_four_standard_deviations_large():
         assert size == pytest.approx(4 * float(one.stds.max()))
         torch.testing.assert_close(centre, one.means[0].double())
     for name in ("scales", "opacities"):  # without a size, or invisible
-        assert content_size(one.replace(**{name: torch.full_like(getattr(one, name), -math.inf)}))[1] == 1.0
+        assert (
+            content_size(one.replace(**{name: torch.full_like(getattr(one, name), -math.inf)}))[1]
+            == 1.0
+        )
 
 
 def test_a_thinned_scene_covers_as_much():
@@ -33,7 +36,9 @@ def test_a_thinned_scene_covers_as_much():
 
     def cover(scene: Gaussians) -> float:
         black = scene.replace(features_dc=torch.full_like(scene.features_dc, -10.0))
-        return float(1 - render(black, Views(view.viewmat[None], view.K[None], 64, 48, white)[0]).mean())
+        return float(
+            1 - render(black, Views(view.viewmat[None], view.K[None], 64, 48, white)[0]).mean()
+        )
 
     assert len(thin) <= len(room) // 8 + len(room) // 64 and cover(thin) > 0.8 * cover(room)
 
@@ -44,9 +49,12 @@ VIEWS = Views(torch.eye(4)[None], K, 100, 100, torch.zeros(3))
 """At a depth of 5, a unit is 20 pixels; the picture has 10,000."""
 
 
-def flat(x: float, stds: tuple[float, float], alpha: float, turn: float = 0.0, copies: int = 1) -> Gaussians:
+def flat(
+    x: float, stds: tuple[float, float], alpha: float, turn: float = 0.0, copies: int = 1
+) -> Gaussians:
     """Flat Gaussians that face the camera, at (x, 0, 5); ``turn`` radians about its axis."""
-    means, quat = torch.tensor([[x, 0.0, 5.0]] * copies), [math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
+    means = torch.tensor([[x, 0.0, 5.0]] * copies)
+    quat = [math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
     return splats(means, torch.tensor([*stds, 1e-9]).log(), torch.tensor(alpha).logit(), quats=quat)
 
 
@@ -55,7 +63,8 @@ def rectangle(reach: float, stds: tuple[float, float]) -> float:
     return math.prod(2 * reach * math.sqrt((20 * std) ** 2 + 0.3) for std in stds)
 
 
-SQUARE, LONG = (0.1, 0.1), (0.4, 0.05)
+SQUARE = (0.1, 0.1)
+LONG = (0.4, 0.05)
 
 FAINT = math.sqrt(2 * math.log(255 * 0.02))  # where an opacity of 0.02 falls to 1/255
 
@@ -67,7 +76,10 @@ FAINT = math.sqrt(2 * math.log(255 * 0.02))  # where an opacity of 0.02 falls to
         (flat(0.0, LONG, 0.9, turn=0.5), rectangle(math.sqrt(8), LONG)),
         (flat(0.0, SQUARE, 0.02), rectangle(FAINT, SQUARE)),
         (flat(0.0, SQUARE, 0.9, copies=3), 3 * rectangle(math.sqrt(8), SQUARE)),
-        (flat(-2.5, SQUARE, 0.9), rectangle(math.sqrt(8), SQUARE) / 2),  # its middle is on the edge of the picture
+        (
+            flat(-2.5, SQUARE, 0.9),
+            rectangle(math.sqrt(8), SQUARE) / 2,
+        ),  # its middle is on the edge of the picture
         (flat(0.0, (100.0, 100.0), 0.9), 10_000),  # all of the picture
         (flat(-20.0, SQUARE, 0.9), 0),  # outside
         (flat(0.0, SQUARE, 0.001), 0),  # fainter than 1/255

@@ -22,7 +22,8 @@ from pointsplat_ns.views import Views
 
 
 def places_of(views):
-    rotation, translation = views.viewmats[:, :3, :3], views.viewmats[:, :3, 3:]
+    rotation = views.viewmats[:, :3, :3]
+    translation = views.viewmats[:, :3, 3:]
     return -(rotation.mT @ translation)[..., 0]
 
 
@@ -31,17 +32,27 @@ def test_sampled_poses_are_rotations_and_show_the_scene(hollow_ball):
     assert len(views) == 12 and (views.width, views.height) == (64, 48)
     rotation = views.viewmats[:, :3, :3]
     # 1e-12: unit vectors in float64
-    assert torch.allclose(rotation @ rotation.mT, torch.eye(3).double().expand(12, 3, 3), atol=1e-12)
+    assert torch.allclose(
+        rotation @ rotation.mT, torch.eye(3).double().expand(12, 3, 3), atol=1e-12
+    )
     assert torch.allclose(torch.linalg.det(rotation), torch.ones(12).double(), atol=1e-12)
     assert all(render(hollow_ball, views[i]).mean() > 0.02 for i in range(12))
 
 
 @pytest.mark.parametrize(
     "name, value",
-    [*(("scales", value) for value in (-1e4, -80.0, 80.0, 1e4)), ("opacities", 1e4), ("opacities", -1e4),
-     ("quats", 0.0), ("quats", 3e38), ("means", 3e38), ("means", 1e-40), ("features_dc", 3e38),
-     ("features_rest", 3e38)],
-)  # fmt: skip
+    [
+        *(("scales", value) for value in (-1e4, -80.0, 80.0, 1e4)),
+        ("opacities", 1e4),
+        ("opacities", -1e4),
+        ("quats", 0.0),
+        ("quats", 3e38),
+        ("means", 3e38),
+        ("means", 1e-40),
+        ("features_dc", 3e38),
+        ("features_rest", 3e38),
+    ],
+)
 def test_some_extreme_gaussians_leave_views_and_likelihoods_finite(hollow_ball, name, value):
     scene = hollow_ball.map(lambda tensor: tensor.clone())
     getattr(scene, name)[:: 2 if name == "scales" else 20] = value
@@ -62,7 +73,9 @@ def test_a_scene_that_shows_nothing_has_no_poses(hollow_ball):
 
 def test_looking_straight_up_or_at_oneself_is_a_rotation_too():
     places = torch.zeros(4, 3, dtype=torch.float64)
-    targets = torch.tensor([[0, 0, 1.0], [0, 0, -1.0], [0, 0, 0], [1e-30, 0, 1e-30]], dtype=torch.float64)
+    targets = torch.tensor(
+        [[0, 0, 1.0], [0, 0, -1.0], [0, 0, 0], [1e-30, 0, 1e-30]], dtype=torch.float64
+    )
     rotation = look_at(places, targets)[:, :3, :3]
     assert torch.allclose(rotation @ rotation.mT, torch.eye(3).double().expand(4, 3, 3), atol=1e-12)
     assert torch.allclose(rotation[0] @ targets[0], torch.tensor([0, 0, 1.0]).double(), atol=1e-12)
@@ -72,10 +85,13 @@ def test_views_are_upright_and_above_the_floor_for_any_turn_of_the_scene():
     turn = TURNS[1]
     views = sample_views(turned(room(), turn), 8, 64, 48)
     up = torch.from_numpy(turn.apply([0.0, 0.0, 1.0]))
-    places = places_of(views) @ torch.from_numpy(turn.as_matrix())  # as in the room before it was turned
+    places = places_of(views) @ torch.from_numpy(
+        turn.as_matrix()
+    )  # as in the room before it was turned
     floor = float(room().means[:, 2].min())
     assert float(places[:, 2].min()) > floor
-    right, ahead = views.viewmats[:, 0, :3], views.viewmats[:, 2, :3]
+    right = views.viewmats[:, 0, :3]
+    ahead = views.viewmats[:, 2, :3]
     # sines: 3 degrees of error in the estimate of up; no view from straight above
     assert float((right @ up).abs().max()) < 0.05 and float((ahead @ up).abs().max()) < 0.99
     assert float((views.viewmats[:, 1, :3] @ up).max()) < 0  # the image is not upside down
@@ -96,9 +112,14 @@ def test_an_object_is_in_the_middle_and_seen_from_all_sides():
     turns = torch.atan2(places[:, 1], places[:, 0]).sort().values
     gaps = torch.cat([turns[1:], turns[:1] + 2 * math.pi]) - turns
     assert float(gaps.max()) < 0.6 * math.pi
-    middle = views.viewmats[:, :3, :3] @ torch.tensor([0.0, 0.0, 1.0]).double() + views.viewmats[:, :3, 3]
+    middle = (
+        views.viewmats[:, :3, :3] @ torch.tensor([0.0, 0.0, 1.0]).double()
+        + views.viewmats[:, :3, 3]
+    )
     pixels = (views.Ks @ middle[..., None])[..., 0]
-    aside = (pixels[:, :2] / pixels[:, 2:] - torch.tensor([32.0, 24.0])).abs() / torch.tensor([32.0, 24.0])
+    aside = (pixels[:, :2] / pixels[:, 2:] - torch.tensor([32.0, 24.0])).abs() / torch.tensor(
+        [32.0, 24.0]
+    )
     assert bool((pixels[:, 2] > 0).all()) and float(aside.amax(1).median()) < 0.6
 
 
@@ -118,7 +139,8 @@ def test_up_can_be_given():
 def test_views_do_not_depend_on_the_unit_of_length(make, factor):
     scene = make()
     other = scene.replace(means=scene.means * factor, scales=scene.scales + math.log(factor))
-    one, two = sample_views(scene, 6, 64, 48, seed=3), sample_views(other, 6, 64, 48, seed=3)
+    one = sample_views(scene, 6, 64, 48, seed=3)
+    two = sample_views(other, 6, 64, 48, seed=3)
     assert two.near_plane == pytest.approx(one.near_plane * factor, rel=1e-4)
     # 1e-3: float32 positions round otherwise at another scale
     assert torch.allclose(places_of(one) * factor, places_of(two), rtol=1e-3, atol=1e-3 * factor)
@@ -129,7 +151,8 @@ def test_views_of_a_large_scene_are_looked_for_in_a_part_of_it(monkeypatch):
     scene = box_room(0, 3000)
     whole = Sampler(scene).content
     monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=600))
-    few, given = Sampler(scene, (64, 48)), Sampler(enlarged(scene[::5], 5), (64, 48), stands_for=5)
+    few = Sampler(scene, (64, 48))
+    given = Sampler(enlarged(scene[::5], 5), (64, 48), stands_for=5)
     assert len(few.scene) == 600 and len(few.views(3)) == 3
     assert torch.equal(few.views(3).viewmats, given.views(3).viewmats)
     assert few.content[1] == pytest.approx(whole[1], rel=0.05)
@@ -156,7 +179,8 @@ def sampler_of(scene: Gaussians) -> Sampler:
 
 
 def test_the_likelihood_is_that_of_its_formula():
-    sampler, views = sampler_of(wall()), seen_from(2.0, 3.0)
+    sampler = sampler_of(wall())
+    views = seen_from(2.0, 3.0)
     likelihoods, shown = sampler.judged(views)
     small = replace(views.resized(LOOKING.candidate_side), rasterize_mode="antialiased")
     width = 0.06 * UNITS / sampler.content[1]
@@ -166,13 +190,16 @@ def test_the_likelihood_is_that_of_its_formula():
         blur = float((pixels * width / away).sum() / pixels.sum())
         empty = 1 - float(pixels.sum()) / (view.width * view.height)
         share = (float((pixels > 0.02).sum()) + 1) / 3000
-        expected = math.log(share / (empty + 0.01) / blur**2) - 0.5 * (15 / 25) ** 2  # they look level
+        expected = (
+            math.log(share / (empty + 0.01) / blur**2) - 0.5 * (15 / 25) ** 2
+        )  # they look level
         assert float(likelihoods[row]) == pytest.approx(expected, abs=1e-4)  # float32
         assert float(shown[row].sum()) + 1 == pytest.approx(share * 3000)
 
 
 def test_evidence_of_sh_counts_where_there_are_sh():
-    scene, views = ball(500, 1, opacity=5.0), seen_from(12.0, 15.0)
+    scene = ball(500, 1, opacity=5.0)
+    views = seen_from(12.0, 15.0)
     without = scene.replace(features_rest=torch.zeros_like(scene.features_rest))
     traces = PhotoTraces(in_units(scene, *content_size(scene)))
     added = sampler_of(scene).judged(views)[0] - sampler_of(without).judged(views)[0]

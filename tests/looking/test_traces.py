@@ -20,7 +20,8 @@ from pointsplat_ns.views import Views
 
 def test_places_of_photos_are_found():
     found = PhotoTraces(photographed())
-    places, shares = found.places, found.shares
+    places = found.places
+    shares = found.shares
     assert found.sure
     away = torch.cdist(places, EYES.double()).min(1).values
     assert float(shares.sum()) == pytest.approx(1) and bool((shares > 0).all())
@@ -45,7 +46,9 @@ def test_correlation_is_that_of_float64_at_any_size(size):
     [
         normal_scene(3000),
         ball(501, 0).replace(
-            scales=torch.tensor([[-1.0] * 3, [-math.inf, -1.0, -1.0], [-math.inf] * 3]).repeat(167, 1)
+            scales=torch.tensor([[-1.0] * 3, [-math.inf, -1.0, -1.0], [-math.inf] * 3]).repeat(
+                167, 1
+            )
         ),
         ball(500, 0).replace(scales=torch.full((500, 3), -math.inf)),
         ball(500, 0).replace(means=torch.zeros(500, 3)),
@@ -57,13 +60,19 @@ def test_correlation_is_that_of_float64_at_any_size(size):
 )
 def test_no_place_is_sure_in_scenes_without_evidence_and_none_is_infinite(scene):
     found = PhotoTraces(scene)
-    assert not found.sure and bool(found.shares.isfinite().all()) and bool(found.places.isfinite().all())
+    assert (
+        not found.sure
+        and bool(found.shares.isfinite().all())
+        and bool(found.places.isfinite().all())
+    )
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e38])
 def test_photo_places_are_found_from_sh_of_any_length_but_zero(factor):
     scene = photographed()
-    large = scene.replace(features_rest=(scene.features_rest.double() * factor).clamp(-3e38, 3e38).float())
+    large = scene.replace(
+        features_rest=(scene.features_rest.double() * factor).clamp(-3e38, 3e38).float()
+    )
     found = PhotoTraces(large)
     assert found.sure == (factor != 1e-30)
     assert bool(found.places.isfinite().all()) and float(found.shares.sum()) == pytest.approx(1)
@@ -85,8 +94,12 @@ def flattened(scene: Gaussians) -> Gaussians:
     return scene.replace(scales=scales)
 
 
-@pytest.mark.parametrize(("scene", "ratio", "within"), [(halves(2.0), 2**1.5, 0.05), (flattened(halves(1.0)), 3, 0.1)])
-def test_trace_factors_grow_with_sh_energy_to_the_power_of_three_quarters_and_with_flatness(scene, ratio, within):
+@pytest.mark.parametrize(
+    ("scene", "ratio", "within"), [(halves(2.0), 2**1.5, 0.05), (flattened(halves(1.0)), 3, 0.1)]
+)
+def test_trace_factors_grow_with_sh_energy_to_the_power_of_three_quarters_and_with_flatness(
+    scene, ratio, within
+):
     factors = trace_factors(scene, torch.arange(2000))
     # within: the SH of both halves are random
     apart = factors[:900].double().log().mean() - factors[1100:].double().log().mean()
@@ -103,20 +116,28 @@ def test_extremes_stay_within_bounds(dtype):
         rest[1000:] = size
         scales = scene.scales.clone()
         scales[:500] = -math.inf
-        scales[500:800, 0], scales[800:900, 2] = -math.inf, 0.5 * largest
-        factors = trace_factors(scene.replace(features_rest=rest, scales=scales), torch.arange(2000))
+        scales[500:800, 0] = -math.inf
+        scales[800:900, 2] = 0.5 * largest
+        factors = trace_factors(
+            scene.replace(features_rest=rest, scales=scales), torch.arange(2000)
+        )
         assert bool(factors.isfinite().all())
         assert float(factors.log().abs().max()) <= LOOKING.max_log_factor + 1e-5
 
 
 def test_views_are_sampled_where_photos_were_taken():
     """A smooth shell around photos that were all taken from about one place."""
-    eye, shape = torch.tensor([0.6, 0.0, 0.0]), {"opacities": torch.full((3000, 1), 5.0)}
-    scene, shell = (some.replace(**shape) for some in (photographed(3000, eyes=eye[None]), ball(3000, 3)))
+    eye = torch.tensor([0.6, 0.0, 0.0])
+    shape = {"opacities": torch.full((3000, 1), 5.0)}
+    scene, shell = (
+        some.replace(**shape) for some in (photographed(3000, eyes=eye[None]), ball(3000, 3))
+    )
     assert PhotoTraces(scene).sure
     away = []
     for views in (sample_views(scene, 4, 64, 48), sample_views(shell, 4, 64, 48)):
-        away.append(float((invert_rigid(views.viewmats)[:, :3, 3] - eye.double()).norm(dim=1).mean()))
+        away.append(
+            float((invert_rigid(views.viewmats)[:, :3, 3] - eye.double()).norm(dim=1).mean())
+        )
     assert away[0] < 0.5 and away[0] < 0.5 * away[1]
 
 
@@ -126,9 +147,11 @@ def scene() -> Gaussians:
 
 
 def test_given_views_go_before_a_datasets_and_those_before_sampled_ones(scene, trained_walls):
-    run, given = run_of(trained_walls, "wall-b"), sample_views(scene, 3, 48, 36)
+    run = run_of(trained_walls, "wall-b")
+    given = sample_views(scene, 3, 48, 36)
     of_run = ViewSource(scene, run=run, dataset_views=dataset_views)
-    known, views = of_run.known(4), of_run.views(4)
+    known = of_run.known(4)
+    views = of_run.views(4)
     assert len(known) == len(views) == 4 and of_run.origin == "poses of the dataset"
     assert (views.width, views.height, views.rasterize_mode) == (64, 48, "antialiased")
     assert views.background.tolist() == [1.0, 1.0, 1.0]
@@ -136,7 +159,9 @@ def test_given_views_go_before_a_datasets_and_those_before_sampled_ones(scene, t
     assert source.views(9) is given and len(source.known(2)) == 2 and source.origin == "given views"
     gone = ViewSource(scene, run=run, dataset_views=data_is_gone)
     assert len(gone.views(2)) == 2
-    assert gone.origin == f"sampled poses, up is {gone.sampler.up} (no dataset: its data is not there)"
+    assert (
+        gone.origin == f"sampled poses, up is {gone.sampler.up} (no dataset: its data is not there)"
+    )
     assert ViewSource(scene, run="scene.ply", dataset_views=dataset_views).known(4) is None
     assert ViewSource(scene, given=given[:0]).known(3) is None
     with pytest.raises(DataError, match="the views given are empty"):

@@ -16,29 +16,43 @@ from pointsplat_ns.system.threads import fixed_threads
 def test_psnr_of_a_known_error():
     target = torch.full((8, 8, 3), 0.5, dtype=torch.float64)
     for decibels in (10.0, 20.0, 30.0):
-        assert float(psnr(target + 10 ** (-decibels / 20), target)) == pytest.approx(decibels, abs=1e-9)
+        assert float(psnr(target + 10 ** (-decibels / 20), target)) == pytest.approx(
+            decibels, abs=1e-9
+        )
 
 
 @pytest.mark.parametrize("covered", [1.0, 0.25, 1e-300])
 @pytest.mark.parametrize("error", [5e-324, 1e-12, 1e-4, 1.0, 1e6, 1e300])
 def test_psnr_of_covered_pixels_at_all_extremes(error, covered):
     assert psnr_of(error, covered) == pytest.approx(-10 * (math.log10(error) - math.log10(covered)))
-    assert psnr_of(0.0, covered) == psnr_of(0.0, 0.0) == math.inf and psnr_of(error, 0.0) == psnr_of(error)
+    assert psnr_of(0.0, covered) == psnr_of(0.0, 0.0) == math.inf and psnr_of(
+        error, 0.0
+    ) == psnr_of(error)
     assert math.isnan(psnr_of(math.nan, covered))
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_gradients_agree_with_float64_differences(metric):
     a, b = pair(12, 13, dtype=torch.float64)
-    assert torch.autograd.gradcheck(metric, (a.requires_grad_(), b.requires_grad_()), fast_mode=True)
+    assert torch.autograd.gradcheck(
+        metric, (a.requires_grad_(), b.requires_grad_()), fast_mode=True
+    )
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
 @pytest.mark.parametrize(
     ("a", "b", "message"),
     [
-        (torch.rand(3, 20, 20), torch.rand(3, 20, 20), r"pred has shape \(3, 20, 20\); expected \(H, W, 3\)"),
-        (torch.rand(20, 20, 3), torch.rand(20, 21, 3), r"pred has shape \(20, 20, 3\) but target \(20, 21, 3\)"),
+        (
+            torch.rand(3, 20, 20),
+            torch.rand(3, 20, 20),
+            r"pred has shape \(3, 20, 20\); expected \(H, W, 3\)",
+        ),
+        (
+            torch.rand(20, 20, 3),
+            torch.rand(20, 21, 3),
+            r"pred has shape \(20, 20, 3\) but target \(20, 21, 3\)",
+        ),
         (torch.rand(20, 20, 3), torch.rand(20, 20), "target has shape"),
         (torch.zeros(0, 20, 20, 3), torch.zeros(0, 20, 20, 3), "pred has shape"),
         (torch.zeros(20, 20, 3, dtype=torch.uint8), torch.zeros(20, 20, 3), "pred is torch.uint8"),
@@ -55,7 +69,9 @@ needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.wh
 def images(*shape: int, dtype=torch.float64):
     generator = torch.Generator().manual_seed(11)
     image = torch.rand(shape, generator=generator, dtype=dtype)
-    return image.requires_grad_(), (0.7 * image.detach() + 0.3 * torch.rand(shape, generator=generator, dtype=dtype))
+    return image.requires_grad_(), (
+        0.7 * image.detach() + 0.3 * torch.rand(shape, generator=generator, dtype=dtype)
+    )
 
 
 @pytest.mark.filterwarnings("ignore:Skipping Gaussian Smoothing")
@@ -64,11 +80,15 @@ def images(*shape: int, dtype=torch.float64):
 def test_value_and_gradient_are_pytorch_msssims(size, batch):
     image, other = images(batch, 3, *size)
     stock = SSIM(data_range=1.0, size_average=True, channel=3)
-    value, expected = mean_ssim(image, other), stock(image, other)
-    # pytorch-msssim keeps its window in float32: 1e-7 relative on moments of order 1, over C2 = 9e-4 at worst.
+    value = mean_ssim(image, other)
+    expected = stock(image, other)
+    # pytorch-msssim keeps its window in float32: 1e-7 relative on moments of order 1, over C2 =
+    # 9e-4 at worst.
     torch.testing.assert_close(value, expected, atol=1e-5, rtol=0)
     if min(size) >= 11:
-        torch.testing.assert_close(ssim(*(x.permute(0, 2, 3, 1) for x in (image, other))).mean(), value)
+        torch.testing.assert_close(
+            ssim(*(x.permute(0, 2, 3, 1) for x in (image, other))).mean(), value
+        )
     (gradient,), (other_gradient,) = (torch.autograd.grad(v, image) for v in (value, expected))
     assert (gradient - other_gradient).abs().max() <= 1e-4 * other_gradient.abs().max()
 
@@ -83,8 +103,11 @@ def test_flat_images_in_float32_match_float64_in_value_and_gradient(level, compi
         value = mean_ssim(image, (image + noise.to(dtype)).detach(), compiled)
         value.backward()
         result[dtype] = value.detach().double(), image.grad.double()
-    # Variances are differences of squares near level^2, so 6e-8 of it is lost, relative to C2 = 9e-4.
-    torch.testing.assert_close(result[torch.float32][0], result[torch.float64][0], atol=1e-3, rtol=0)
+    # Variances are differences of squares near level^2, so 6e-8 of it is lost, relative to C2 =
+    # 9e-4.
+    torch.testing.assert_close(
+        result[torch.float32][0], result[torch.float64][0], atol=1e-3, rtol=0
+    )
     assert (result[torch.float32][1] - result[torch.float64][1]).abs().max() < 1e-3
 
 
@@ -100,12 +123,16 @@ def found(image, other, dtype, compiled, first=True):
 @needs_compiler
 @pytest.mark.parametrize("first", [True, False])
 @pytest.mark.parametrize("together", [True, False], ids=["channels together", "planes"])
-@pytest.mark.parametrize("shape", [(1, 3, 11, 11), (1, 3, 130, 150), (2, 1, 12, 139), (2, 4, 60, 43), (1, 6, 11, 40)])
+@pytest.mark.parametrize(
+    "shape", [(1, 3, 11, 11), (1, 3, 130, 150), (2, 1, 12, 139), (2, 4, 60, 43), (1, 6, 11, 40)]
+)
 def test_compiled_it_is_torchs_and_as_near_to_float64(shape, together, first):
     image, other = images(*shape)
     if together:
         image, other = (x.detach().to(memory_format=torch.channels_last) for x in (image, other))
-    ours, torchs = (found(image, other, torch.float32, compiled, first) for compiled in (True, False))
+    ours, torchs = (
+        found(image, other, torch.float32, compiled, first) for compiled in (True, False)
+    )
     exact = found(image, other, torch.float64, False, first)
     assert abs(ours[0] - exact[0]) <= 1e-6
     assert (ours[1] - exact[1]).norm() <= 2 * (torchs[1] - exact[1]).norm() + 1e-6 * exact[1].norm()
@@ -125,7 +152,9 @@ def test_a_pixel_that_is_not_finite_spoils_only_its_windows():
 
 
 def test_images_below_the_window_are_said():
-    with pytest.raises(ImageError, match="20 x 10 pixels are smaller than SSIM's window; expected at least 11 x 11"):
+    with pytest.raises(
+        ImageError, match="20 x 10 pixels are smaller than SSIM's window; expected at least 11 x 11"
+    ):
         ssim(torch.rand(10, 20, 3), torch.rand(10, 20, 3))
 
 
@@ -134,7 +163,9 @@ def test_losses_of_large_pictures_have_the_same_gradients_on_any_number_of_threa
         found = []
         for count in (1, 2, 3):
             difference = (
-                torch.rand(360, 640, 3, generator=torch.Generator().manual_seed(seed)).sub(0.5).requires_grad_()
+                torch.rand(360, 640, 3, generator=torch.Generator().manual_seed(seed))
+                .sub(0.5)
+                .requires_grad_()
             )
             with fixed_threads(count):
                 sum(loss(difference) for loss in PIXEL_LOSSES.values()).backward()

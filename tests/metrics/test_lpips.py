@@ -15,7 +15,13 @@ from torch.nn import functional
 
 from making import noisy_pair as pair
 from pointsplat_ns.metrics import ImageError, lpips
-from pointsplat_ns.metrics.lpips import WEIGHTS_VARIABLE, Lpips, LpipsUnavailable, ReportedLpips, load_lpips
+from pointsplat_ns.metrics.lpips import (
+    WEIGHTS_VARIABLE,
+    Lpips,
+    LpipsUnavailable,
+    ReportedLpips,
+    load_lpips,
+)
 
 NETS = ["alex", "vgg"]
 LINEAR = Path(torchmetrics.__file__).parent / "functional/image/lpips_models"
@@ -29,7 +35,9 @@ def random_backbone(net, seed=0):
             continue
         # He's initialisation keeps the activations of one size through all layers.
         spread = math.sqrt(2 / empty[0].numel()) if name.endswith("weight") else 0.1
-        state[f"features.{name.split('.', 2)[2]}"] = spread * torch.randn(empty.shape, generator=generator)
+        state[f"features.{name.split('.', 2)[2]}"] = spread * torch.randn(
+            empty.shape, generator=generator
+        )
     return state
 
 
@@ -65,20 +73,26 @@ def files_below(folder):
 
 
 def by_formula(state, linear, net, a, b):
-    """LPIPS of images (B, H, W, 3) by its publication, in float64: distances of unit-length features of five ReLUs."""
+    """LPIPS of images (B, H, W, 3) by its publication, in float64: distances of unit-length
+    features of five ReLUs."""
     ends = {
         "alex": ((0, 3, 6, 8, 10), (0, 3, 6, 8, 10)),
         "vgg": ((0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), (2, 7, 14, 21, 28)),
     }
     convolutions, compared = ends[net]
     stride, padding = {"alex": ({0: 4}, {0: 2, 3: 2}), "vgg": ({}, {})}[net]
-    shift, spread = torch.tensor([-0.030, -0.088, -0.188]).double(), torch.tensor([0.458, 0.448, 0.450]).double()
-    total, maps = 0.0, [((2 * x.double() - 1 - shift) / spread).permute(0, 3, 1, 2) for x in (a, b)]
+    shift = torch.tensor([-0.030, -0.088, -0.188]).double()
+    spread = torch.tensor([0.458, 0.448, 0.450]).double()
+    total = 0.0
+    maps = [((2 * x.double() - 1 - shift) / spread).permute(0, 3, 1, 2) for x in (a, b)]
     for index in convolutions:
         weight, bias = (state[f"features.{index}.{name}"].double() for name in ("weight", "bias"))
         if index in {"alex": (3, 6), "vgg": (5, 10, 17, 24)}[net]:
             maps = [functional.max_pool2d(x, 3 if net == "alex" else 2, 2) for x in maps]
-        maps = [functional.conv2d(x, weight, bias, stride.get(index, 1), padding.get(index, 1)).relu() for x in maps]
+        maps = [
+            functional.conv2d(x, weight, bias, stride.get(index, 1), padding.get(index, 1)).relu()
+            for x in maps
+        ]
         if index in compared:
             first, second = (x / (x.square().sum(1, keepdim=True) + 1e-8).sqrt() for x in maps)
             weight = linear[f"lin{compared.index(index)}.model.1.weight"].double()
@@ -88,15 +102,22 @@ def by_formula(state, linear, net, a, b):
 
 @pytest.mark.parametrize("net", NETS)
 def test_lpips_is_that_of_its_publication_and_draws_no_random_number(net, tmp_path):
-    state, path = random_backbone(net), tmp_path / "backbone.pth"
+    state = random_backbone(net)
+    path = tmp_path / "backbone.pth"
     torch.save(state, path)
     a, b = pair(2, 64, 80)
     linear = torch.load(LINEAR / f"{net}.pth", map_location="cpu", weights_only=True)
-    expected, before = by_formula(state, linear, net, a, b), torch.get_rng_state()
+    expected = by_formula(state, linear, net, a, b)
+    before = torch.get_rng_state()
     model = Lpips(net).load(path)
     # 1e-5: float32 convolutions; the values are about 0.1
-    assert torch.allclose(model(a, b).double(), expected, atol=1e-5, rtol=1e-5) and expected.min() > 1e-3
-    assert torch.equal(torch.get_rng_state(), before) and not any(p.requires_grad for p in model.parameters())
+    assert (
+        torch.allclose(model(a, b).double(), expected, atol=1e-5, rtol=1e-5)
+        and expected.min() > 1e-3
+    )
+    assert torch.equal(torch.get_rng_state(), before) and not any(
+        p.requires_grad for p in model.parameters()
+    )
 
 
 def test_the_gradient_is_finite_where_every_feature_is_zero(alex_file):
@@ -106,7 +127,9 @@ def test_the_gradient_is_finite_where_every_feature_is_zero(alex_file):
         state[f"features.{index}.bias"] = torch.zeros_like(state[f"features.{index}.bias"])
     torch.save(state, alex_file.parent / "dead.pth")
     dead = Lpips("alex").load(alex_file.parent / "dead.pth")
-    pred = torch.ones(40, 40, 3, requires_grad=True)  # bright: all first features are below zero, so cut off
+    pred = torch.ones(
+        40, 40, 3, requires_grad=True
+    )  # bright: all first features are below zero, so cut off
     value = dead(pred, torch.zeros(40, 40, 3))
     value.backward()
     assert value.isfinite() and pred.grad.isfinite().all()
@@ -115,30 +138,49 @@ def test_the_gradient_is_finite_where_every_feature_is_zero(alex_file):
 @pytest.mark.parametrize("net", NETS)
 def test_the_smallest_image_works_and_smaller_ones_are_refused(net, tmp_path):
     torch.save(random_backbone(net), tmp_path / "b.pth")
-    model, least = Lpips(net).load(tmp_path / "b.pth"), {"alex": 31, "vgg": 16}[net]
+    model = Lpips(net).load(tmp_path / "b.pth")
+    least = {"alex": 31, "vgg": 16}[net]
     assert model(*pair(least, least + 5)).isfinite()
-    with pytest.raises(ImageError, match=f"images of {least} x {least - 1} pixels are too small for LPIPS with {net}"):
+    with pytest.raises(
+        ImageError,
+        match=f"images of {least} x {least - 1} pixels are too small for LPIPS with {net}",
+    ):
         model(*pair(least - 1, least))
 
 
 def test_a_report_has_the_value_or_the_reason_why_there_is_none(alex_file, alex, nowhere, tmp_path):
     lpips = ReportedLpips()
     for _ in range(2):  # a download that failed is not tried again
-        assert lpips(*pair(40, 40)) is None and f"set {WEIGHTS_VARIABLE} to a folder with alexnet" in lpips.reason
-    assert "alex backbone cannot be downloaded (<urlopen error [Errno -3] Temporary failure in" in lpips.reason
-    assert nowhere == ["https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"] and not files_below(tmp_path)
+        assert (
+            lpips(*pair(40, 40)) is None
+            and f"set {WEIGHTS_VARIABLE} to a folder with alexnet" in lpips.reason
+        )
+    assert (
+        "alex backbone cannot be downloaded (<urlopen error [Errno -3] Temporary failure in"
+        in lpips.reason
+    )
+    assert nowhere == [
+        "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
+    ] and not files_below(tmp_path)
     found = tmp_path / "hub/checkpoints/alexnet-owt-7be5be79.pth"
     found.parent.mkdir(parents=True, exist_ok=True)
     found.symlink_to(alex_file)  # but looked for again
     lpips = ReportedLpips()
-    assert torch.equal(lpips(*pair(40, 40)), alex(*pair(40, 40))) and lpips.reason is None and len(nowhere) == 1
+    assert (
+        torch.equal(lpips(*pair(40, 40)), alex(*pair(40, 40)))
+        and lpips.reason is None
+        and len(nowhere) == 1
+    )
     assert lpips(*pair(20, 40)) is None and "40 x 20 pixels are too small" in lpips.reason
 
 
 def test_weights_are_found_by_the_variable(alex_file, alex, monkeypatch, nowhere):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file.parent))
     first = "network.net.slice1.0.weight"
-    assert torch.equal(load_lpips("alex").state_dict()[first], alex.state_dict()[first]) and not nowhere
+    assert (
+        torch.equal(load_lpips("alex").state_dict()[first], alex.state_dict()[first])
+        and not nowhere
+    )
     with pytest.raises(LpipsUnavailable, match="vgg backbone cannot be downl"):
         load_lpips("vgg")
 
@@ -198,8 +240,12 @@ def test_files_that_are_no_backbone_are_said(alex_file, tmp_path, content, messa
 
 def test_a_folder_that_is_named_and_not_there_is_said(tmp_path, monkeypatch, nowhere):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "gone"))
-    with pytest.raises(LpipsUnavailable, match=f"gone: no such folder, though {WEIGHTS_VARIABLE} names it"):
+    with pytest.raises(
+        LpipsUnavailable, match=f"gone: no such folder, though {WEIGHTS_VARIABLE} names it"
+    ):
         load_lpips()
-    with pytest.raises(LpipsUnavailable, match="no LPIPS network is called 'squeeze'; expected one of alex, vgg"):
+    with pytest.raises(
+        LpipsUnavailable, match="no LPIPS network is called 'squeeze'; expected one of alex, vgg"
+    ):
         load_lpips("squeeze")
     assert not nowhere

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import (
+    FullImageDatamanager,
+    FullImageDatamanagerConfig,
+)
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
@@ -81,14 +84,16 @@ def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):
     plain = FullImageDatamanagerConfig(dataparser=parser, cache_images_type="uint8")
     lazy, stock = (config.setup(device="cpu") for config in (room_for_three, plain))
     for step in range(2 * len(lazy.train_dataset) + 1):
-        (camera, data), (other, expected) = lazy.next_train(step), stock.next_train(step)
+        (camera, data) = lazy.next_train(step)
+        (other, expected) = stock.next_train(step)
         assert data["image_idx"] == expected["image_idx"] == camera.metadata["cam_idx"]
         assert torch.equal(data["image"], expected["image"])
         assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
         assert torch.equal(camera.get_intrinsics_matrices(), other.get_intrinsics_matrices())
     assert lazy.frame_cache._entries.currsize <= 3e4
     assert lazy.get_train_rays_per_batch() == stock.get_train_rays_per_batch()
-    ours, theirs = list(lazy.fixed_indices_eval_dataloader), list(stock.fixed_indices_eval_dataloader)
+    ours = list(lazy.fixed_indices_eval_dataloader)
+    theirs = list(stock.fixed_indices_eval_dataloader)
     assert len(ours) == len(theirs) == len(lazy.fixed_indices_eval_dataloader) > 1
     for (camera, data), (other, expected) in zip(ours, theirs, strict=True):
         assert torch.equal(data["image"], expected["image"])
@@ -101,17 +106,27 @@ def test_a_sweep_trains_on_the_photos_of_a_run(trained_walls, tmp_path, monkeypa
     run = run_of(trained_walls, "wall-b")
     monkeypatch.setitem(PHOTO_STEPS, "quick", 64)
     found = ps.measure_tradeoff(run, tmp_path / "trade", keep=("10%",), repairs=("none", "photos"))
-    photos, scene = run_photos(run, "test"), ps.load(run)
-    errors = [ps.psnr(ps.render(scene, photo.view), in_unit_range(photo.target)) for photo in photos]
-    assert found.points[0].against_photos.psnr == pytest.approx(float(torch.stack(errors).mean()), abs=1e-4)
+    photos = run_photos(run, "test")
+    scene = ps.load(run)
+    errors = [
+        ps.psnr(ps.render(scene, photo.view), in_unit_range(photo.target)) for photo in photos
+    ]
+    assert found.points[0].against_photos.psnr == pytest.approx(
+        float(torch.stack(errors).mean()), abs=1e-4
+    )
     assert found.scene == "wall-b" and found.views_origin == "held-out photos of the dataset"
     trained = next(point for point in found.points if point.repair == "photos")
-    pruned = next(point for point in found.points if point.repair == "none" and point.gaussians == trained.gaussians)
+    pruned = next(
+        point
+        for point in found.points
+        if point.repair == "none" and point.gaussians == trained.gaussians
+    )
     assert trained.against_photos.psnr > pruned.against_photos.psnr + 0.1
     assert " --photos " in trained.command
 
 
-WIDTH, HEIGHT = 40, 30
+WIDTH = 40
+HEIGHT = 30
 
 
 def make_dataset(
@@ -125,9 +140,13 @@ def make_dataset(
 ) -> UndistortedDataset:
     width, height = size
     rng = np.random.default_rng(7)
-    photos, mask_paths = ([folder / f"{kind}{i}.png" for i in range(num)] for kind in ("photo", "mask"))
+    photos, mask_paths = (
+        [folder / f"{kind}{i}.png" for i in range(num)] for kind in ("photo", "mask")
+    )
     for i in range(num):
-        cv2.imwrite(str(photos[i]), cv2.resize(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8), size))
+        cv2.imwrite(
+            str(photos[i]), cv2.resize(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8), size)
+        )
         mask = np.full((height, width), 255, np.uint8)
         mask[:, : 5 + i] = 0
         cv2.imwrite(str(mask_paths[i]), mask)
@@ -135,7 +154,9 @@ def make_dataset(
     poses[:, 0, 3] = torch.arange(num)
     lens = None if distortion is None else torch.tensor(distortion)
     metadata = {"fisheye_crop_radius": 14.0} if camera_type == CameraType.FISHEYE624 else None
-    cameras = Cameras(poses, 35.0, 36.0, 20.5, 14.0, width, height, lens, camera_type, metadata=metadata)
+    cameras = Cameras(
+        poses, 35.0, 36.0, 20.5, 14.0, width, height, lens, camera_type, metadata=metadata
+    )
     outputs = DataparserOutputs(
         image_filenames=photos,
         cameras=cameras,
@@ -146,7 +167,8 @@ def make_dataset(
 
 
 ARIA = CameraType.FISHEYE624
-"""The lens of Project Aria's glasses; nerfstudio makes masks of its own for it, and takes no others."""
+"""The lens of Project Aria's glasses; nerfstudio makes masks of its own for it, and takes no
+others."""
 
 
 @pytest.mark.parametrize(
@@ -158,7 +180,9 @@ ARIA = CameraType.FISHEYE624
         ([0.02, -0.01, *[0.0] * 10], ARIA, False),
     ],
 )
-def test_image_mask_and_intrinsics_are_those_nerfstudio_caches(tmp_path, distortion, camera_type, masks):
+def test_image_mask_and_intrinsics_are_those_nerfstudio_caches(
+    tmp_path, distortion, camera_type, masks
+):
     dataset = make_dataset(tmp_path, distortion=distortion, camera_type=camera_type, masks=masks)
     frames = Frames(dataset)
     changed, _ = frames[0]
@@ -170,24 +194,37 @@ def test_image_mask_and_intrinsics_are_those_nerfstudio_caches(tmp_path, distort
     manager = FullImageDatamanager.__new__(FullImageDatamanager)
     torch.nn.Module.__init__(manager)
     manager.config = FullImageDatamanagerConfig(cache_images_type="uint8")
-    manager.train_dataset, manager.device = InputDataset(dataset._dataparser_outputs), "cpu"
+    manager.train_dataset = InputDataset(dataset._dataparser_outputs)
+    manager.device = "cpu"
     expected = manager._load_images("train", cache_images_device="gpu")
     for i, (camera, data) in enumerate(got):
-        assert torch.equal(data["image"], expected[i]["image"]) and data["image"].dtype == torch.uint8
+        assert (
+            torch.equal(data["image"], expected[i]["image"]) and data["image"].dtype == torch.uint8
+        )
         assert ("mask" in data) == (masks or camera_type == ARIA) and data["image_idx"] == i
-        assert "mask" not in data or torch.equal(data["mask"], expected[i]["mask"]) and data["mask"].dtype == torch.bool
+        assert (
+            "mask" not in data
+            or torch.equal(data["mask"], expected[i]["mask"])
+            and data["mask"].dtype == torch.bool
+        )
         theirs = manager.train_dataset.cameras[i : i + 1]
         assert torch.equal(camera.get_intrinsics_matrices(), theirs.get_intrinsics_matrices())
-        assert data["image"].shape[:2] == (int(camera.height), int(camera.width)) == (theirs.height, theirs.width)
+        assert (
+            data["image"].shape[:2]
+            == (int(camera.height), int(camera.width))
+            == (theirs.height, theirs.width)
+        )
         assert torch.equal(camera.camera_to_worlds, theirs.camera_to_worlds)
 
 
 @pytest.mark.parametrize("scale", [1 / 3, 0.29, 0.58])
 def test_reduced_photos_are_of_the_size_of_their_cameras(tmp_path, scale):
-    """Some products of a size and a scale are a whole number in float32, and just below it in float64."""
+    """Some products of a size and a scale are a whole number in float32, and just below it in
+    float64."""
     for width, height in ((540, 360), (360, 640), (100, 50)):
         dataset = make_dataset(tmp_path, num=1, scale=scale, size=(width, height))
-        camera, image = dataset.cameras[0], dataset.get_data(0, "uint8")["image"]
+        camera = dataset.cameras[0]
+        image = dataset.get_data(0, "uint8")["image"]
         assert (int(camera.width), int(camera.height)) == (image.shape[1], image.shape[0])
 
 
@@ -217,7 +254,9 @@ def test_a_lens_that_cannot_be_undone_is_named(tmp_path):
 def test_photos_of_several_times_are_refused_as_a_scene_here_has_none(tmp_path):
     outputs = make_dataset(tmp_path)._dataparser_outputs
     outputs.cameras.times = torch.tensor([[0.0], [0.5], [1.0], [0.5], [0.0]])
-    with pytest.raises(DataError, match=f"{tmp_path}: its 5 photos are of 3 different times; .* not move"):
+    with pytest.raises(
+        DataError, match=f"{tmp_path}: its 5 photos are of 3 different times; .* not move"
+    ):
         UndistortedDataset(outputs)
     outputs.cameras.times = torch.full((5, 1), 0.5)
     assert len(UndistortedDataset(outputs)) == 5
@@ -228,28 +267,37 @@ def test_only_photos_that_nerfstudio_reads_rightly_are_read(tmp_path, mode):
     dataset = make_dataset(tmp_path)
     Image.new(mode, (WIDTH, HEIGHT)).save(dataset.image_filenames[2])
     if mode in ("I;16", "P"):
-        with pytest.raises(DataError, match="photo2.png: cannot be read .* its pixels are of mode .*expected 8-bit"):
+        with pytest.raises(
+            DataError, match="photo2.png: cannot be read .* its pixels are of mode .*expected 8-bit"
+        ):
             Frames(dataset)[2]
     else:
         assert Frames(dataset)[2][1]["image"].shape == (HEIGHT, WIDTH, 4 if mode == "RGBA" else 3)
 
 
-@pytest.mark.parametrize(("orientation", "hint"), [(3, "give the camera the size"), (6, "mogrify -auto-orient")])
+@pytest.mark.parametrize(
+    ("orientation", "hint"), [(3, "give the camera the size"), (6, "mogrify -auto-orient")]
+)
 def test_a_photo_that_its_exif_turns_is_said(tmp_path, orientation, hint):
     """The camera is that of the turned photo; the pixels are stored as the sensor had them."""
-    dataset, exif = make_dataset(tmp_path), Image.Exif()
+    dataset = make_dataset(tmp_path)
+    exif = Image.Exif()
     exif[274] = orientation
     Image.new("RGB", (HEIGHT, WIDTH)).save(dataset.image_filenames[2], exif=exif)
     with pytest.raises(DataError, match=f"photo2.png: .* pixels, but its camera says .*{hint}"):
         Frames(dataset)[2]
 
 
-@pytest.mark.parametrize(("name", "value"), [("camera_to_worlds", float("nan")), ("cy", float("inf"))])
+@pytest.mark.parametrize(
+    ("name", "value"), [("camera_to_worlds", float("nan")), ("cy", float("inf"))]
+)
 def test_a_camera_that_is_not_finite_names_its_photo(tmp_path, name, value):
     outputs = make_dataset(tmp_path)._dataparser_outputs
     numbers = getattr(outputs.cameras, name).clone()  # one number may stand for all cameras
     for index in (1, 3):
         numbers[index].view(-1)[-1] = value
     setattr(outputs.cameras, name, numbers)
-    with pytest.raises(DataError, match="photo1.png: .* frame 1 hold NaN or infinity, as do those of 1 more of 5"):
+    with pytest.raises(
+        DataError, match="photo1.png: .* frame 1 hold NaN or infinity, as do those of 1 more of 5"
+    ):
         UndistortedDataset(outputs)

@@ -32,7 +32,8 @@ class Layout:
     frames: int = FRAMES
     """Photos that are used."""
     wrong: float = 0.002
-    """How far photos may be off on average, in [0, 1]: rounding to 8 bits is 0.001; undistorting interpolates."""
+    """How far photos may be off on average, in [0, 1]: rounding to 8 bits is 0.001; undistorting
+    interpolates."""
 
 
 def as_colmap(capture: Capture, folder: Path) -> Path:
@@ -45,7 +46,9 @@ LAYOUTS = {
     "nerfstudio-data": Layout(
         Lens(), Capture.write_nerfstudio, lambda: NerfstudioDataParserConfig(load_3D_points=True)
     ),
-    "colmap": Layout(Lens(distortion=(0.12, -0.05, 0.004, -0.003)), as_colmap, ColmapDataParserConfig),
+    "colmap": Layout(
+        Lens(distortion=(0.12, -0.05, 0.004, -0.003)), as_colmap, ColmapDataParserConfig
+    ),
     "scannetpp-seeded": Layout(
         FISHEYE, Capture.write_scannetpp, SeededScanNetppDataParserConfig, frames=FRAMES - len(BAD)
     ),
@@ -55,14 +58,16 @@ LAYOUTS = {
 @pytest.fixture(scope="module", params=LAYOUTS)
 def opened(request, wall_config, tmp_path_factory) -> tuple[Capture, Layout, Pipeline]:
     layout = LAYOUTS[request.param]
-    capture, folder = Capture(layout.lens), tmp_path_factory.mktemp("capture")
+    capture = Capture(layout.lens)
+    folder = tmp_path_factory.mktemp("capture")
     config = wall_config(layout.write(capture, folder / "data"), folder / "outputs", 1)
     config.pipeline.datamanager.dataparser = layout.dataparser()
     return capture, layout, config.pipeline.setup(device="cpu", test_mode="val")
 
 
 def wrongness(frame: Frame, outputs: DataparserOutputs) -> float:
-    """Mean difference, in [0, 1], between a photo and what its camera sees in the room, where no mask is."""
+    """Mean difference, in [0, 1], between a photo and what its camera sees in the room, where no
+    mask is."""
     camera, data = frame
     rays = camera.generate_rays(0)
     turn, shift = outputs.dataparser_transform.double().split([3, 1], dim=1)
@@ -79,7 +84,8 @@ def wrongness(frame: Frame, outputs: DataparserOutputs) -> float:
 
 def test_every_pixel_shows_what_its_camera_sees(opened):
     _, layout, pipeline = opened
-    manager, outputs = pipeline.datamanager, pipeline.datamanager.train_dataparser_outputs
+    manager = pipeline.datamanager
+    outputs = pipeline.datamanager.train_dataparser_outputs
     held_out = manager.fixed_indices_eval_dataloader
     frames = [*manager.train_frames, *held_out]
     assert len(held_out) > 0 and len(frames) == layout.frames
@@ -92,7 +98,8 @@ def test_every_pixel_shows_what_its_camera_sees(opened):
 def test_a_scene_starts_from_the_points_of_the_capture(opened):
     capture, _, pipeline = opened
     outputs = pipeline.datamanager.train_dataparser_outputs
-    transform, points = outputs.dataparser_transform.double(), torch.from_numpy(capture.seeds)
+    transform = outputs.dataparser_transform.double()
+    points = torch.from_numpy(capture.seeds)
     placed = (points @ transform[:, :3].T + transform[:, 3]) * outputs.dataparser_scale
     # 1e-5: float32
     torch.testing.assert_close(outputs.metadata["points3D_xyz"].double(), placed, atol=1e-5, rtol=0)
@@ -114,7 +121,11 @@ def own_scene(scene, tmp_path) -> Path:
 
 
 def parsed(scene: Path, split: str = "train", **settings) -> DataparserOutputs:
-    return SeededScanNetppDataParserConfig(data=scene, **settings).setup().get_dataparser_outputs(split)
+    return (
+        SeededScanNetppDataParserConfig(data=scene, **settings)
+        .setup()
+        .get_dataparser_outputs(split)
+    )
 
 
 def numbers(outputs: DataparserOutputs) -> list[int]:
@@ -123,9 +134,15 @@ def numbers(outputs: DataparserOutputs) -> list[int]:
 
 def test_bad_frames_leave_both_splits_with_their_masks_and_cameras(scene):
     for split, wanted in (("train", set(range(FRAMES)) - set(HELD_OUT)), ("test", set(HELD_OUT))):
-        ours, every = parsed(scene, split), ScanNetppDataParserConfig(data=scene).setup().get_dataparser_outputs(split)
-        assert numbers(ours) == sorted(wanted - set(BAD)) and len(numbers(every)) == len(numbers(ours)) + 1
-        assert [path.stem for path in ours.mask_filenames] == [path.stem for path in ours.image_filenames]
+        ours = parsed(scene, split)
+        every = ScanNetppDataParserConfig(data=scene).setup().get_dataparser_outputs(split)
+        assert (
+            numbers(ours) == sorted(wanted - set(BAD))
+            and len(numbers(every)) == len(numbers(ours)) + 1
+        )
+        assert [path.stem for path in ours.mask_filenames] == [
+            path.stem for path in ours.image_filenames
+        ]
         kept = [numbers(every).index(number) for number in numbers(ours)]
         assert torch.equal(ours.cameras.camera_to_worlds, every.cameras.camera_to_worlds[kept])
         assert torch.equal(ours.dataparser_transform, every.dataparser_transform)
@@ -143,11 +160,15 @@ def test_without_points_there_are_no_seed_points_and_a_line_says_so(own_scene, c
 def change(scene: Path, **values) -> None:
     """Change entries of transforms.json; None removes one."""
     meta = json.loads((scene / TRANSFORMS).read_text()) | values
-    (scene / TRANSFORMS).write_text(json.dumps({name: value for name, value in meta.items() if value is not None}))
+    (scene / TRANSFORMS).write_text(
+        json.dumps({name: value for name, value in meta.items() if value is not None})
+    )
 
 
 def rewritten(name: str, before: str, after: str) -> Callable[[Path], object]:
-    return lambda scene: (scene / name).write_text((scene / name).read_text().replace(before, after))
+    return lambda scene: (scene / name).write_text(
+        (scene / name).read_text().replace(before, after)
+    )
 
 
 @pytest.mark.parametrize(
@@ -157,16 +178,31 @@ def rewritten(name: str, before: str, after: str) -> Callable[[Path], object]:
             rewritten(TRANSFORMS, "0.3", "0.4"),
             "poses of 10 photos are not those of transforms.json.*--load-seed-points",
         ),
-        (rewritten("dslr/colmap/images.txt", ".png", ".jpg"), "knows none of the 10 photos by name"),
+        (
+            rewritten("dslr/colmap/images.txt", ".png", ".jpg"),
+            "knows none of the 10 photos by name",
+        ),
         (
             rewritten(TRANSFORMS, "false", "true"),
             "train split: all 7 frames are hidden or marked is_bad.*--skip-bad False",
         ),
         (lambda scene: (scene / "dslr/colmap/images.txt").unlink(), r"no images.bin or images.txt"),
-        (lambda scene: (scene / "dslr/colmap/points3D.txt").write_text("1 2 3\n"), "points3D.txt: cannot be read"),
-        (lambda scene: (scene / TRANSFORMS).unlink(), "transforms.json: no such file.*--data names"),
-        (lambda scene: (scene / "dslr/resized_images/00001.png").unlink(), "1 of 7 .* missing, first 00001.png"),
-        (lambda scene: (scene / TRANSFORMS).write_text("{}"), "KeyError: 'frames'; expected JSON with frames"),
+        (
+            lambda scene: (scene / "dslr/colmap/points3D.txt").write_text("1 2 3\n"),
+            "points3D.txt: cannot be read",
+        ),
+        (
+            lambda scene: (scene / TRANSFORMS).unlink(),
+            "transforms.json: no such file.*--data names",
+        ),
+        (
+            lambda scene: (scene / "dslr/resized_images/00001.png").unlink(),
+            "1 of 7 .* missing, first 00001.png",
+        ),
+        (
+            lambda scene: (scene / TRANSFORMS).write_text("{}"),
+            "KeyError: 'frames'; expected JSON with frames",
+        ),
         (lambda scene: (scene / TRANSFORMS).write_text("{"), "transforms.json: JSONDecodeError"),
     ],
 )
@@ -181,7 +217,8 @@ def test_hidden_photos_of_a_test_leave_a_split_of_the_others(own_scene, scene, c
     for number in HELD_OUT:
         (own_scene / f"dslr/resized_images/{number:05d}.png").unlink()
         (own_scene / f"dslr/resized_anon_masks/{number:05d}.png").unlink()
-    train, held_out = parsed(own_scene, skip_bad=False), parsed(own_scene, "test", skip_bad=False)
+    train = parsed(own_scene, skip_bad=False)
+    held_out = parsed(own_scene, "test", skip_bad=False)
     assert len(numbers(held_out)) >= 1 and not {*numbers(train)} & {*numbers(held_out)}
     assert {*numbers(train), *numbers(held_out)} == {*range(FRAMES)} - {*HELD_OUT}
     same = torch.equal(train.dataparser_transform, parsed(scene).dataparser_transform)
@@ -189,7 +226,9 @@ def test_hidden_photos_of_a_test_leave_a_split_of_the_others(own_scene, scene, c
     assert "photos of the test are hidden" in " ".join(capsys.readouterr().out.split())
     frames = json.loads((scene / TRANSFORMS).read_text())["frames"]
     change(own_scene, frames=frames, test_frames=None)  # no lists either: every tenth is held out
-    assert [len(numbers(parsed(own_scene, split, skip_bad=False))) for split in ("train", "test")] == [6, 1]
+    assert [
+        len(numbers(parsed(own_scene, split, skip_bad=False))) for split in ("train", "test")
+    ] == [6, 1]
 
 
 def test_photos_are_held_out_by_the_lists_where_there_are_no_test_frames(own_scene, scene):
@@ -204,7 +243,9 @@ def test_photos_are_held_out_by_the_lists_where_there_are_no_test_frames(own_sce
 
 def test_a_fraction_splits_as_nerfstudio_splits_colmap_models(scene, tmp_path):
     data = as_colmap(Capture(Lens()), tmp_path / "colmap")
-    theirs = ColmapDataParserConfig(data=data, eval_mode="fraction", train_split_fraction=0.7, downscale_factor=1)
+    theirs = ColmapDataParserConfig(
+        data=data, eval_mode="fraction", train_split_fraction=0.7, downscale_factor=1
+    )
     for split in ("train", "test"):
         ours = parsed(scene, split, skip_bad=False, train_split_fraction=0.7)
         assert numbers(ours) == numbers(theirs.setup().get_dataparser_outputs(split))
@@ -215,7 +256,12 @@ def test_a_fraction_splits_as_nerfstudio_splits_colmap_models(scene, tmp_path):
 @pytest.mark.parametrize(
     ("transforms", "photos", "masks", "colmap"),
     [
-        ("dslr/nerfstudio/transforms_undistorted.json", "dslr/undistorted_images", "dslr/undistorted_anon_masks", None),
+        (
+            "dslr/nerfstudio/transforms_undistorted.json",
+            "dslr/undistorted_images",
+            "dslr/undistorted_anon_masks",
+            None,
+        ),
         ("nerfstudio/transforms.json", "images", "masks", "colmap"),
         ("iphone/nerfstudio/transforms.json", "iphone/rgb", "iphone/rgb_masks", "iphone/colmap"),
     ],
@@ -230,13 +276,20 @@ def test_what_the_toolkit_writes_is_read(own_scene, scene, transforms, photos, m
         (own_scene / TRANSFORMS).write_text(json.dumps(meta))
         (own_scene / colmap).parent.mkdir(exist_ok=True)
         (own_scene / "dslr/colmap").rename(own_scene / colmap)
-    moves = {TRANSFORMS: transforms, "dslr/resized_images": photos, "dslr/resized_anon_masks": masks}
+    moves = {
+        TRANSFORMS: transforms,
+        "dslr/resized_images": photos,
+        "dslr/resized_anon_masks": masks,
+    }
     for before, after in moves.items():
         (own_scene / after).parent.mkdir(exist_ok=True)
         (own_scene / before).rename(own_scene / after)
     for split in ("train", "test"):
-        ours, plain = parsed(own_scene, split), parsed(scene, split)
-        assert numbers(ours) == numbers(plain) and all(path.is_file() for path in ours.image_filenames)
+        ours = parsed(own_scene, split)
+        plain = parsed(scene, split)
+        assert numbers(ours) == numbers(plain) and all(
+            path.is_file() for path in ours.image_filenames
+        )
         assert all(path.is_file() for path in ours.mask_filenames)
         assert torch.equal(ours.cameras.camera_to_worlds, plain.cameras.camera_to_worlds)
         assert ("points3D_xyz" in ours.metadata) == (split == "train")

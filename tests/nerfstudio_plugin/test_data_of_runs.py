@@ -32,16 +32,23 @@ def moved(wall_scene, tmp_path) -> Path:
 
 
 def keep_data_of_a(runs: Path, trained_walls: Path) -> None:
-    shutil.copy(run_of(trained_walls, "wall-a") / "config.yml", run_of(runs, "wall-a") / "config.yml")
+    shutil.copy(
+        run_of(trained_walls, "wall-a") / "config.yml", run_of(runs, "wall-a") / "config.yml"
+    )
 
 
 def test_the_data_is_found_at_or_below_the_folder_that_is_named(runs, moved, trained_walls):
-    run, known = run_of(runs, "wall-a"), ps.dataset_views(run_of(trained_walls, "wall-a"))
-    with pytest.raises(SceneError, match=r"gone_from_here.*name the folder where it is now \(--data DIR\)"):
+    run = run_of(runs, "wall-a")
+    known = ps.dataset_views(run_of(trained_walls, "wall-a"))
+    with pytest.raises(
+        SceneError, match=r"gone_from_here.*name the folder where it is now \(--data DIR\)"
+    ):
         ps.dataset_views(run)
     for place in (moved, moved / "wall"):
         assert torch.equal(ps.dataset_views(run, data=place).viewmats, known.viewmats)
-    with pytest.raises(SceneError, match="nowhere: no such folder; expected the data of .*gone_from_here"):
+    with pytest.raises(
+        SceneError, match="nowhere: no such folder; expected the data of .*gone_from_here"
+    ):
         ps.dataset_views(run, data=moved / "nowhere")
 
 
@@ -57,14 +64,24 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_each_command_takes_the_folder_and_refuses_one_without_the_data(command, runs, moved, tmp_path, capfd):
-    words = COMMANDS[command].replace("RUN", str(run_of(runs, "wall-b"))).replace("OUT", str(tmp_path)).split()
+def test_each_command_takes_the_folder_and_refuses_one_without_the_data(
+    command, runs, moved, tmp_path, capfd
+):
+    words = (
+        COMMANDS[command]
+        .replace("RUN", str(run_of(runs, "wall-b")))
+        .replace("OUT", str(tmp_path))
+        .split()
+    )
     with pytest.raises(SystemExit) as ended:
         main([command, *words, "--data", str(tmp_path / "nowhere")])
     assert ended.value.code == 1 and "nowhere: no such folder" in capfd.readouterr().err
     main([command, *words, "--data", str(moved)])
     said = capfd.readouterr()
-    assert "sampled in free space" not in said.out + said.err and "gone_from_here" not in said.out + said.err
+    assert (
+        "sampled in free space" not in said.out + said.err
+        and "gone_from_here" not in said.out + said.err
+    )
 
 
 def test_data_is_not_for_a_scene_without_a_run(moved, tmp_path):
@@ -74,11 +91,17 @@ def test_data_is_not_for_a_scene_without_a_run(moved, tmp_path):
             ps.prune(scene, 100, data=moved)
 
 
-def test_a_run_without_its_data_does_not_stop_a_folder_and_is_named(runs, moved, trained_walls, tmp_path):
+def test_a_run_without_its_data_does_not_stop_a_folder_and_is_named(
+    runs, moved, trained_walls, tmp_path
+):
     keep_data_of_a(runs, trained_walls)
     results = ps.compact_folder(runs, tmp_path / "out", "50%", effort="instant")
     assert [result.status for result in results] == ["done", "done"]
-    assert results[0].note == "" and results[1].note.startswith("no dataset: ") and "gone_from_here" in results[1].note
+    assert (
+        results[0].note == ""
+        and results[1].note.startswith("no dataset: ")
+        and "gone_from_here" in results[1].note
+    )
     assert json.loads((tmp_path / "out" / "wall-b.ply.json").read_text())["note"] == results[1].note
     with pytest.raises(SceneError, match="holds results of other options"):
         ps.compact_folder(runs, tmp_path / "out", "50%", effort="instant", data=moved)
@@ -86,11 +109,17 @@ def test_a_run_without_its_data_does_not_stop_a_folder_and_is_named(runs, moved,
     assert [(result.status, result.note) for result in results] == [("done", ""), ("done", "")]
 
 
-def test_a_training_leaves_out_a_run_without_its_photos_and_names_it(runs, moved, trained_walls, capfd):
+def test_a_training_leaves_out_a_run_without_its_photos_and_names_it(
+    runs, moved, trained_walls, capfd
+):
     def manager_of(**settings):
-        return ScenesDataManagerConfig(data=runs, cache_gigabytes=0.01, **settings).setup(test_mode="val")
+        return ScenesDataManagerConfig(data=runs, cache_gigabytes=0.01, **settings).setup(
+            test_mode="val"
+        )
 
-    with pytest.raises(SceneError, match="gone_from_here.*that of 1 more runs; .*scene-data DIR.*supervision dense"):
+    with pytest.raises(
+        SceneError, match="gone_from_here.*that of 1 more runs; .*scene-data DIR.*supervision dense"
+    ):
         manager_of()
     assert [scene.name for scene in manager_of(scene_data=moved).scenes] == ["wall-a", "wall-b"]
     keep_data_of_a(runs, trained_walls)
@@ -101,18 +130,24 @@ def test_a_training_leaves_out_a_run_without_its_photos_and_names_it(runs, moved
     assert [scene.has_photos for scene in dense if isinstance(scene, TrainedScene)] == [True, False]
 
 
-def test_a_refiners_run_finds_the_scenes_that_moved(make_refined_run, trained_walls, runs, tmp_path):
+def test_a_refiners_run_finds_the_scenes_that_moved(
+    make_refined_run, trained_walls, runs, tmp_path
+):
     run = make_refined_run(tmp_path / "out", tmp_path / "gone" / "runs")
     with pytest.raises(SceneError, match="gone"):
         ps.load(run)
     assert len(ps.load(run, data=tmp_path)) > 0
 
 
-NUM_TRAIN, SEED = 9, 5
+NUM_TRAIN = 9
+SEED = 5
 
 
-def with_state(trained_walls: Path, folder: Path, mode: str | None = None, **state: torch.Tensor) -> Path:
-    """A copy of a trained run with more in its checkpoint, and another mode of the camera optimizer."""
+def with_state(
+    trained_walls: Path, folder: Path, mode: str | None = None, **state: torch.Tensor
+) -> Path:
+    """A copy of a trained run with more in its checkpoint, and another mode of the camera
+    optimizer."""
     run = folder / "wall-b" / "splatfacto-cpu" / "copied"
     shutil.copytree(run_of(trained_walls, "wall-b"), run)
     (checkpoint,) = (run / "nerfstudio_models").glob("*.ckpt")
@@ -127,14 +162,21 @@ def with_state(trained_walls: Path, folder: Path, mode: str | None = None, **sta
 
 
 ADJUSTMENTS = 0.5 * torch.randn(NUM_TRAIN, 6, generator=torch.Generator().manual_seed(SEED))
-"""Motions of up to about a unit and a radian; none, and one so small that exponentials are near their limit."""
+"""Motions of up to about a unit and a radian; none, and one so small that exponentials are near
+their limit."""
 ADJUSTMENTS[0], ADJUSTMENTS[1] = 0.0, 1e-6 * ADJUSTMENTS[1]
 
 
 @pytest.mark.parametrize(("mode", "key"), [("SO3xR3", "_model"), ("SE3", "_model.module")])
 def test_training_poses_are_corrected_as_by_nerfstudios_model(mode, key, trained_walls, tmp_path):
-    run = with_state(trained_walls, tmp_path, mode, **{f"{key}.camera_optimizer.pose_adjustment": ADJUSTMENTS})
-    plain = ScenesDataManagerConfig(data=run_of(trained_walls, "wall-b")).setup(test_mode="val").training_frames(0)
+    run = with_state(
+        trained_walls, tmp_path, mode, **{f"{key}.camera_optimizer.pose_adjustment": ADJUSTMENTS}
+    )
+    plain = (
+        ScenesDataManagerConfig(data=run_of(trained_walls, "wall-b"))
+        .setup(test_mode="val")
+        .training_frames(0)
+    )
     optimizer = CameraOptimizerConfig(mode=mode).setup(num_cameras=NUM_TRAIN, device="cpu")
     optimizer.pose_adjustment.data = ADJUSTMENTS
     cameras = [camera for camera, _ in plain]
@@ -144,28 +186,45 @@ def test_training_poses_are_corrected_as_by_nerfstudios_model(mode, key, trained
     before = torch.cat([camera.camera_to_worlds for camera in cameras])
     assert float((expected - before).abs().max()) > 0.3 and torch.equal(expected[0], before[0])
 
-    held_out = (ps.dataset_views(path, "test").viewmats for path in (run_of(trained_walls, "wall-b"), run))
+    held_out = (
+        ps.dataset_views(path, "test").viewmats for path in (run_of(trained_walls, "wall-b"), run)
+    )
     assert torch.equal(*held_out), "these have no correction"
     views = viewmats_from_opengl(expected)
     photos = run_photos(run)
     assert torch.allclose(ps.dataset_views(run).viewmats, views, atol=1e-6)
     assert torch.allclose(torch.stack([photo.view.viewmat for photo in photos]), views, atol=1e-6)
     for supervision in ("photos", "dense"):
-        frames = ScenesDataManagerConfig(data=run, supervision=supervision).setup(test_mode="val").training_frames(0)
-        assert torch.allclose(torch.cat([camera.camera_to_worlds for camera, _ in frames]), expected, atol=1e-6)
+        frames = (
+            ScenesDataManagerConfig(data=run, supervision=supervision)
+            .setup(test_mode="val")
+            .training_frames(0)
+        )
+        assert torch.allclose(
+            torch.cat([camera.camera_to_worlds for camera, _ in frames]), expected, atol=1e-6
+        )
 
 
 @pytest.mark.parametrize(
     ("values", "mode", "error", "text"),
     [
-        (ADJUSTMENTS[:8], "SE3", DataError, "9 training photos, but .* corrects the poses of 8; put back the data"),
+        (
+            ADJUSTMENTS[:8],
+            "SE3",
+            DataError,
+            "9 training photos, but .* corrects the poses of 8; put back the data",
+        ),
         (ADJUSTMENTS, None, SceneError, "config.yml: .*mode 'off'.*expected SO3xR3 or SE3"),
         (ADJUSTMENTS / 0, "SE3", SceneError, "expected six finite numbers"),
         (ADJUSTMENTS[:, :5], "SE3", SceneError, r"shape \(9, 5\); expected six"),
     ],
 )
-def test_corrections_that_do_not_fit_are_refused(values, mode, error, text, trained_walls, tmp_path):
-    run = with_state(trained_walls, tmp_path, mode, **{"_model.camera_optimizer.pose_adjustment": values})
+def test_corrections_that_do_not_fit_are_refused(
+    values, mode, error, text, trained_walls, tmp_path
+):
+    run = with_state(
+        trained_walls, tmp_path, mode, **{"_model.camera_optimizer.pose_adjustment": values}
+    )
     with pytest.raises(error, match=text):
         ps.dataset_views(run)
 

@@ -15,7 +15,9 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 RUN = SHARED_DATA / "splatfacto" / "fox" / "splatfacto" / "2026-11-26_gsplat"
 CAPTURE = SHARED_DATA / "scannetpp" / "fox"
 
-pytestmark = pytest.mark.skipif(not RUN.is_dir() or not CAPTURE.is_dir(), reason="the genuine run is not at hand")
+pytestmark = pytest.mark.skipif(
+    not RUN.is_dir() or not CAPTURE.is_dir(), reason="the genuine run is not at hand"
+)
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +40,14 @@ def test_its_checkpoint_is_read_to_the_bit(run):
 
 
 def test_its_renders_show_its_held_out_photos(run):
-    photos, scene = run_photos(run, "test"), ps.load(run)
+    photos = run_photos(run, "test")
+    scene = ps.load(run)
     assert len(photos) == 5 and len(ps.dataset_views(run)) == 45
     grey = [ps.render(scene, photo.view).mean(dim=-1).flatten() for photo in photos]
     seen = [in_unit_range(photo.target).mean(dim=-1).flatten() for photo in photos]
     alike = torch.corrcoef(torch.stack([*grey, *seen]))[:5, 5:]
-    # a ninth of a scene just behind a reset of its opacities is dark: its PSNR tells nothing, its structure does
-    assert torch.equal(alike.argmax(dim=0), torch.arange(5)), alike  # the render that is most like each photo
+    # a ninth of a scene just behind a reset of its opacities is dark: its PSNR tells nothing, its
+    # structure does
+    assert torch.equal(alike.argmax(dim=0), torch.arange(5)), (
+        alike
+    )  # the render that is most like each photo

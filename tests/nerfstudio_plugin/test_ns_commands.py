@@ -1,5 +1,5 @@
-"""nerfstudio's commands by both methods, each trained once by ``ns-train``, with the viewer open, on a tiny capture
-taken through a lens."""
+"""nerfstudio's commands by both methods, each trained once by ``ns-train``, with the viewer open,
+on a tiny capture taken through a lens."""
 
 import json
 import os
@@ -30,14 +30,18 @@ from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainer
 
 STEPS = {"splatfacto-cpu": 20, "pointsplat": 4}
 VIEWER = ("--viewer.websocket-host", "127.0.0.1", "--viewer.image-format", "png")
-WIDTH, HEIGHT, FIELD_OF_VIEW = 40, 30, 60.0
+WIDTH = 40
+HEIGHT = 30
+FIELD_OF_VIEW = 60.0
 
 
 def started(program: types.ModuleType, *words: object) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [program.__name__, *map(str, words)])
         patch.setattr(writer, "EVENT_WRITERS", [])  # those of trainings before in this process
-        patch.setattr(install_checks, "check_ffmpeg_installed", lambda: None)  # ns-render wants it even for pictures
+        patch.setattr(
+            install_checks, "check_ffmpeg_installed", lambda: None
+        )  # ns-render wants it even for pictures
         program.entrypoint()
 
 
@@ -54,10 +58,14 @@ class Run:
         return self.folder / "config.yml"
 
 
-def with_the_viewer_open(method: str, capture: Capture, output: Path, words: list, data: list[str]) -> Run:
-    """Train, look at the viewer after the second step, and end it by Ctrl-C when the training is complete."""
+def with_the_viewer_open(
+    method: str, capture: Capture, output: Path, words: list, data: list[str]
+) -> Run:
+    """Train, look at the viewer after the second step, and end it by Ctrl-C when the training is
+    complete."""
     seen: list[Look] = []
-    update, complete = StoppableTrainer._update_viewer_state, Viewer.training_complete
+    update = StoppableTrainer._update_viewer_state
+    complete = Viewer.training_complete
 
     def looked_at(trainer: StoppableTrainer, step: int) -> None:
         update(trainer, step)
@@ -73,7 +81,9 @@ def with_the_viewer_open(method: str, capture: Capture, output: Path, words: lis
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(StoppableTrainer, "_update_viewer_state", looked_at)
         patch.setattr(Viewer, "training_complete", interrupted)
-        before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background of a shell it is ignored
+        before = signal.signal(
+            signal.SIGINT, signal.default_int_handler
+        )  # in the background of a shell it is ignored
         try:
             started(train, method, *words, *options, "--max-num-iterations", STEPS[method], *data)
         finally:
@@ -98,7 +108,10 @@ def runs(capture, tmp_path_factory) -> dict[str, Run]:
     scene = with_the_viewer_open("splatfacto-cpu", capture, folder, words, data)
     words = [*usual, scene.folder, "--pipeline.model.size", "tiny", "--pipeline.model.by", "paper"]
     words += ["--pipeline.model.lpips-weight", "0", "--pipeline.model.keep", "0.5"]
-    return {run.method: run for run in (scene, with_the_viewer_open("pointsplat", capture, folder, words, []))}
+    return {
+        run.method: run
+        for run in (scene, with_the_viewer_open("pointsplat", capture, folder, words, []))
+    }
 
 
 @pytest.fixture(params=STEPS)
@@ -138,8 +151,18 @@ def test_viewer_serves_its_page_and_what_the_model_draws_until_ctrl_c(run: Run, 
 
 def test_eval_writes_numbers_and_pictures_of_the_held_out_photo(run: Run, no_lpips, tmp_path):
     path = tmp_path / "eval.json"
-    started(evaluate, "--load-config", run.config, "--output-path", path, "--render-output-path", tmp_path / "pictures")
-    report = json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    started(
+        evaluate,
+        "--load-config",
+        run.config,
+        "--output-path",
+        path,
+        "--render-output-path",
+        tmp_path / "pictures",
+    )
+    report = json.loads(
+        path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON")
+    )
     assert report["method_name"] == run.method
     assert report["results"]["psnr"] > 8 and 0 < report["results"]["ssim"] <= 1
     assert report["results"]["lpips"] is None and "no network" in report["results"]["lpips_note"]
@@ -151,7 +174,15 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def drawn(run: Run, way: str, folder: Path, *options: object) -> list[np.ndarray]:
-    words = ["--load-config", run.config, "--output-path", folder / "out", "--image-format", "png", *options]
+    words = [
+        "--load-config",
+        run.config,
+        "--output-path",
+        folder / "out",
+        "--image-format",
+        "png",
+        *options,
+    ]
     started(render, way, *words, "--output-format", "images")
     pictures = [pixels(path) for path in sorted((folder / "out").iterdir())]
     assert all(picture.std() > 0.03 for picture in pictures), "a plain picture proves nothing"
@@ -163,10 +194,25 @@ def drawn_by_the_model(pipeline: Pipeline, camera: Cameras) -> np.ndarray:
     return pipeline.model.get_outputs_for_camera(camera)["rgb"].numpy()
 
 
-def test_camera_path_draws_what_the_model_draws_and_no_other_lens(run: Run, capture: Capture, tmp_path):
-    pose, file = capture.poses[0], tmp_path / "path.json"
-    cameras = [{"camera_to_world": pose.reshape(-1).tolist(), "fov": FIELD_OF_VIEW, "aspect": WIDTH / HEIGHT}] * 2
-    saved = {"render_width": WIDTH, "render_height": HEIGHT, "seconds": 1, "fps": 2, "camera_path": cameras}
+def test_camera_path_draws_what_the_model_draws_and_no_other_lens(
+    run: Run, capture: Capture, tmp_path
+):
+    pose = capture.poses[0]
+    file = tmp_path / "path.json"
+    cameras = [
+        {
+            "camera_to_world": pose.reshape(-1).tolist(),
+            "fov": FIELD_OF_VIEW,
+            "aspect": WIDTH / HEIGHT,
+        }
+    ] * 2
+    saved = {
+        "render_width": WIDTH,
+        "render_height": HEIGHT,
+        "seconds": 1,
+        "fps": 2,
+        "camera_path": cameras,
+    }
     file.write_text(json.dumps({**saved, "camera_type": "fisheye"}))
     with pytest.raises(DataError, match="cameras of kind fisheye: expected perspective"):
         drawn(run, "camera-path", tmp_path, "--camera-path-filename", file)
@@ -190,14 +236,28 @@ def test_interpolate_draws_between_the_photos(run: Run, tmp_path):
 def test_dataset_puts_the_undistorted_photo_beside_each_render(runs, tmp_path):
     run = runs["splatfacto-cpu"]
     words = ["--load-config", run.config, "--output-path", tmp_path, "--image-format", "png"]
-    started(render, "dataset", *words, "--split", "train+test", "--rendered-output-names", "rgb", "gt-rgb", "depth")
+    started(
+        render,
+        "dataset",
+        *words,
+        "--split",
+        "train+test",
+        "--rendered-output-names",
+        "rgb",
+        "gt-rgb",
+        "depth",
+    )
     _, pipeline, _, _ = eval_setup(run.config, test_mode="test")
     manager = pipeline.datamanager
-    for split, dataset, count in (("train", manager.train_dataset, 8), ("test", manager.eval_dataset, 2)):
+    for split, dataset, count in (
+        ("train", manager.train_dataset, 8),
+        ("test", manager.eval_dataset, 2),
+    ):
         names = [sorted((tmp_path / split / kind).iterdir()) for kind in ("rgb", "gt-rgb", "depth")]
         assert len(names[0]) == len(names[1]) == len(names[2]) == count
         for index, (render_path, photo_path) in enumerate(zip(*names[:2], strict=True)):
-            photo, picture = pixels(photo_path), pixels(render_path)
+            photo = pixels(photo_path)
+            picture = pixels(render_path)
             assert photo.shape == picture.shape != (48, 64, 3), "the lens was not undone"
             assert np.abs(photo - dataset[index]["image"].numpy()).max() <= 1 / 255 + 1e-6
             shown = drawn_by_the_model(pipeline, dataset.cameras[index : index + 1])

@@ -1,4 +1,5 @@
-"""The ``replica-data`` dataparser and the Replica layout on disk: what is read, and what each fault says."""
+"""The ``replica-data`` dataparser and the Replica layout on disk: what is read, and what each fault
+says."""
 
 import json
 import logging
@@ -34,9 +35,10 @@ def test_frames_are_held_out_by_step(row):
     assert numbers("val", frame_stride=2, eval_every=3) == [0, 6]
     assert numbers("train", frame_stride=2, eval_every=3) == [2, 4, 8, 10]
     for options, words in (
-        ({"eval_every": 1}, "--eval-every 1"), ({"frame_stride": 0}, "--frame-stride 0"),
+        ({"eval_every": 1}, "--eval-every 1"),
+        ({"frame_stride": 0}, "--frame-stride 0"),
         ({"frame_stride": 12}, "leave 0 for training"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(DataError, match=words):
             parse(row, **options)
 
@@ -53,7 +55,8 @@ def test_cameras_follow_nerfstudio_axes_and_pixel_centres(row):
 
 def test_seed_points_come_from_training_frames_alone_always_the_same(row):
     outputs = parse(row)
-    xyz, rgb = outputs.metadata["points3D_xyz"], outputs.metadata["points3D_rgb"]
+    xyz = outputs.metadata["points3D_xyz"]
+    rgb = outputs.metadata["points3D_rgb"]
     assert xyz.dtype == torch.float32 and rgb.dtype == torch.uint8
     assert torch.all(xyz[:, 2] == 2.0)
     assert float(xyz[:, 0].min()) == pytest.approx(1 - 1.4)  # frame 1, not frame 0, starts the row
@@ -78,12 +81,18 @@ def edit_line(scene: Path, line: int, text: str) -> None:
 
 def test_a_whole_scene_is_read_as_written(scene):
     loaded = load_replica(scene)
-    assert len(loaded) == 4 and loaded.depths is not None and loaded.depths[2].name == "depth000002.png"
+    assert (
+        len(loaded) == 4
+        and loaded.depths is not None
+        and loaded.depths[2].name == "depth000002.png"
+    )
     assert np.allclose(loaded.poses[3, :3, 3], [0.3, 0, 0])
     assert np.all(read_depth(loaded.depths[0], loaded.params) == 2.0)
     assert read_photo(loaded.photos[2], loaded.params)[0, 0].tolist() == [20, 50, 200]
     raw = np.full((6, 8), 1500, np.uint16)
-    raw[0, 0], raw[1, 1] = 0, 65535  # unknown and saturated
+    # unknown and saturated
+    raw[0, 0] = 0
+    raw[1, 1] = 65535
     Image.fromarray(raw).save(loaded.depths[0])
     depth = read_depth(loaded.depths[0], loaded.params)
     assert depth[0, 0] == 0 and depth[1, 1] == 0 and depth[2, 2] == 1.5
@@ -91,18 +100,24 @@ def test_a_whole_scene_is_read_as_written(scene):
     for kind in ("frame", "depth"):
         (scene / "results" / f"{kind}000003.png").rename(scene / "results" / f"{kind}000030.png")
     moved = load_replica(scene)
-    assert moved.params.fx == 5.0 and moved.photos[3].stem == "frame000030", "gaps are fine where counts agree"
+    assert moved.params.fx == 5.0 and moved.photos[3].stem == "frame000030", (
+        "gaps are fine where counts agree"
+    )
     moved.depths[1].unlink()
     assert load_replica(scene).depths is None
 
 
 def test_the_convention_of_pixel_centres_is_told_by_the_principal_point(tmp_path):
-    for number, (camera, expected) in enumerate((
-        ({}, (4.0, 3.0)),  # 3.5 of 8: Replica's own way, counted from the first pixel's centre
-        ({"cx": 4.0, "cy": 3.0}, (4.0, 3.0)),  # exactly half: counted from the corner
-        ({"cx": 3.9, "cy": 3.0}, (4.4, 3.5)),  # a calibration: OpenCV's integer centres
-    )):  # fmt: skip
-        params = load_replica(write_scene(tmp_path / str(number), camera={**CAMERA, **camera})).params
+    for number, (camera, expected) in enumerate(
+        (
+            ({}, (4.0, 3.0)),  # 3.5 of 8: Replica's own way, counted from the first pixel's centre
+            ({"cx": 4.0, "cy": 3.0}, (4.0, 3.0)),  # exactly half: counted from the corner
+            ({"cx": 3.9, "cy": 3.0}, (4.4, 3.5)),  # a calibration: OpenCV's integer centres
+        )
+    ):
+        params = load_replica(
+            write_scene(tmp_path / str(number), camera={**CAMERA, **camera})
+        ).params
         assert params.principal_point == pytest.approx(expected)
 
 
@@ -140,7 +155,10 @@ COLUMN_BY_COLUMN[3, :3] = 1, 2, 3
         (line(2, line_of(np.diag([1.1, 1.1, 1.1, 1]))), ["line 2 is no rigid pose"]),
         (line(2, line_of(np.diag([1, 1, -1, 1]))), ["line 2 is no rigid pose"]),
         (line(1, line_of(COLUMN_BY_COLUMN)), ["line 1 is no rigid pose", "last row 0 0 0 1"]),
-        (lambda scene: [edit_line(scene, i, " ".join(["nan"] * 16)) for i in (1, 2, 3, 4)], ["4 of 4 poses hold NaN"]),
+        (
+            lambda scene: [edit_line(scene, i, " ".join(["nan"] * 16)) for i in (1, 2, 3, 4)],
+            ["4 of 4 poses hold NaN"],
+        ),
     ],
 )
 def test_what_is_missing_or_cannot_be_used_is_named_in_one_line(scene, spoil, words):
@@ -152,7 +170,10 @@ def test_pictures_of_another_kind_or_size_and_broken_ones_are_refused(scene):
     loaded = load_replica(scene)
     photo = loaded.photos[1]
     for spoil, message in (
-        (lambda: Image.new("RGB", (9, 6)).save(photo), "frame000001.png: 9 x 6 pixels; expected 8 x 6"),
+        (
+            lambda: Image.new("RGB", (9, 6)).save(photo),
+            "frame000001.png: 9 x 6 pixels; expected 8 x 6",
+        ),
         (lambda: photo.write_bytes(b""), "not a readable picture"),
         (photo.unlink, "frame000001.png: .*FileNotFoundError"),
     ):
@@ -171,14 +192,17 @@ def test_pictures_of_another_kind_or_size_and_broken_ones_are_refused(scene):
 def test_seed_points_avoid_outlines_and_unknown_pixels(tmp_path):
     scene = load_replica(write_scene(tmp_path / "s", frames=1))
     raw = np.full((6, 8), 1000, np.uint16)
-    raw[:, 4:], raw[0, 0] = 3000, 0
+    raw[:, 4:] = 3000
+    raw[0, 0] = 0
     Image.fromarray(raw).save(scene.depths[0])
     xyz, _ = fuse_depth(scene, 1000)
     # Lost: the columns on both sides of the step, the unknown pixel and its two other neighbours.
     assert len(xyz) == 6 * 6 - 3 and set(np.unique(xyz[:, 2])) == {1.0, 3.0}
 
 
-@pytest.mark.parametrize("lost", ["-inf " * 16, "nan " * 12 + "0 0 0 1", "1 0 0 1e39 0 1 0 0 0 0 1 0 0 0 0 1"])
+@pytest.mark.parametrize(
+    "lost", ["-inf " * 16, "nan " * 12 + "0 0 0 1", "1 0 0 1e39 0 1 0 0 0 0 1 0 0 0 0 1"]
+)
 def test_lost_poses_and_those_beyond_float32_are_dropped_by_line(scene, caplog, lost):
     edit_line(scene, 2, lost)
     with caplog.at_level(logging.WARNING):
@@ -189,7 +213,8 @@ def test_lost_poses_and_those_beyond_float32_are_dropped_by_line(scene, caplog, 
 
 
 def test_sequences_of_semantic_nerf_are_read_as_the_same_scene(row, tmp_path):
-    """``Sequence_1`` of Semantic-NeRF's Replica: other names, depth in millimetres, a field of view of 90 degrees."""
+    """``Sequence_1`` of Semantic-NeRF's Replica: other names, depth in millimetres, a field of view
+    of 90 degrees."""
     sequence = tmp_path / "room_0" / "Sequence_1"
     for folder in ("rgb", "depth"):
         (sequence / folder).mkdir(parents=True)
@@ -205,7 +230,9 @@ def test_sequences_of_semantic_nerf_are_read_as_the_same_scene(row, tmp_path):
     assert theirs.params.fx == theirs.params.fy == 4 and theirs.params.principal_point == (4, 3)
     depths = [read_depth(each.depths[3], each.params) for each in (theirs, ours)]
     assert np.allclose(*depths, atol=6e-4), "half a millimetre of rounding"
-    assert np.array_equal(read_photo(theirs.photos[3], theirs.params), read_photo(ours.photos[3], ours.params))
+    assert np.array_equal(
+        read_photo(theirs.photos[3], theirs.params), read_photo(ours.photos[3], ours.params)
+    )
     with pytest.raises(DataError, match="it contains the scenes Sequence_1: name one of them"):
         load_replica(sequence.parent)
     (sequence / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))

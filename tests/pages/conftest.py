@@ -20,13 +20,19 @@ def rooms() -> list[Gaussians]:
 @pytest.fixture(scope="session")
 def written(rooms, tmp_path_factory) -> Path:
     """The page; shared by all tests, so do not write to it."""
-    return ps.write_page(rooms, tmp_path_factory.mktemp("page") / "room.html", ["dense", "compact"], views=room_views())
+    return ps.write_page(
+        rooms,
+        tmp_path_factory.mktemp("page") / "room.html",
+        ["dense", "compact"],
+        views=room_views(),
+    )
 
 
 @pytest.fixture()
 def endless(monkeypatch) -> tuple[threading.Event, threading.Event]:
     """Merging does not end until it is stopped: events of its begin and its end."""
-    begun, ended = threading.Event(), threading.Event()
+    begun = threading.Event()
+    ended = threading.Event()
 
     def merged(merger, count, progress):
         begun.set()

@@ -27,7 +27,9 @@ def ring(angles: torch.Tensor, radius: float = 3.0, height: float = 1.0) -> ps.V
     """Cameras about (1, 2, 0) that look at it."""
     middle = torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
     angles = angles.double()
-    eyes = middle + torch.stack([radius * angles.cos(), radius * angles.sin(), height + 0 * angles], dim=1)
+    eyes = middle + torch.stack(
+        [radius * angles.cos(), radius * angles.sin(), height + 0 * angles], dim=1
+    )
     return views_at(eyes, middle.expand(len(eyes), 3))
 
 
@@ -76,7 +78,8 @@ def test_walk_never_leans_and_passes_the_views():
 
 
 def test_film_of_an_object_goes_once_around_it(monkeypatch):
-    up, turn = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 2 * math.pi / 12
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    turn = 2 * math.pi / 12
     opening = Opening(ring(turn * torch.arange(12)), Up(up), whole=True)
     monkeypatch.setattr(film, "opening_views", lambda *_: opening)
     scene = ball(20)
@@ -84,8 +87,13 @@ def test_film_of_an_object_goes_once_around_it(monkeypatch):
     torch.testing.assert_close(path.viewmats[0], path.viewmats[-1], rtol=0, atol=1e-9)
     apart = axes(path, 3)[:-1] - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
     assert bool(((apart[:, :2].norm(dim=1) - 3).abs() < 0.15).all())
-    assert float(torch.atan2(apart[:, 1], apart[:, 0]).sort().values.diff().max()) < 1.6 * 2 * math.pi / 36
-    assert float(axes(path, 0)[:, 2].abs().max()) < 1e-9 and bool(((axes(path, 2)[:-1] * apart).sum(1) < 0).all())
+    assert (
+        float(torch.atan2(apart[:, 1], apart[:, 0]).sort().values.diff().max())
+        < 1.6 * 2 * math.pi / 36
+    )
+    assert float(axes(path, 0)[:, 2].abs().max()) < 1e-9 and bool(
+        ((axes(path, 2)[:-1] * apart).sum(1) < 0).all()
+    )
 
 
 def test_another_size_shows_as_much_from_top_to_bottom():

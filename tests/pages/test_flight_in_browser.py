@@ -29,12 +29,15 @@ from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
-pytestmark = pytest.mark.xdist_group("flight")  # one process starts Chromium for all tests of this file
+pytestmark = pytest.mark.xdist_group(
+    "flight"
+)  # one process starts Chromium for all tests of this file
 
 
 @pytest.fixture()
 def opened(browser, written) -> Iterator:
-    """The page of both rooms, just opened and small. Nothing may be complained of while a test uses it."""
+    """The page of both rooms, just opened and small. Nothing may be complained of while a test uses
+    it."""
     browser.get(written.as_uri())
     shrink(browser)
     yield browser
@@ -70,7 +73,9 @@ def needles(scene: Gaussians) -> Gaussians:
 
 
 def moved(scene: Gaussians, by: float, scale: float) -> Gaussians:
-    return scene.replace(means=scale * scene.means + by * scale, scales=scene.scales + np.log(scale))
+    return scene.replace(
+        means=scale * scene.means + by * scale, scales=scene.scales + np.log(scale)
+    )
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -81,7 +86,8 @@ def test_pictures_are_those_of_the_rasterizer(browser, tmp_path, name):
     shrink(browser)
     stage = FlightFrame.of(scene, views)
     (tmp_path / "scene.spz").write_bytes(base64.b64decode(stage.packed(scene, "scene")["spz"]))
-    as_written, as_given = read_spz(tmp_path / "scene.spz"), in_units(scene, stage.centre, stage.size)
+    as_written = read_spz(tmp_path / "scene.spz")
+    as_given = in_units(scene, stage.centre, stage.size)
     for index in range(2):
         browser.execute_script("flight.goTo(arguments[0])", index)
         shown = picture(browser)
@@ -94,24 +100,32 @@ def test_pictures_are_those_of_the_rasterizer(browser, tmp_path, name):
 
 
 def test_the_room_is_that_of_the_rasterizer_in_its_own_units(opened, rooms):
-    stage, own = FlightFrame.of(rooms[0], room_views()), room_views()[0]
+    stage = FlightFrame.of(rooms[0], room_views())
+    own = room_views()[0]
     assert len(stage.views) == 3, "all of it, and then the two views that were given"
     opened.execute_script("flight.goTo(1)")
     for wipe, room in ((1, rooms[0]), (0, rooms[1])):
         opened.execute_script("flight.setWipe(arguments[0])", wipe)
         shown = picture(opened)
         view = replace(view_on(stage, 1, shown), viewmat=own.viewmat, near_plane=own.near_plane)
-        assert abs(view.width / view.height - 1.6) < 0.02 and ps.psnr(shown, ps.render(room, view)) > 40
+        assert (
+            abs(view.width / view.height - 1.6) < 0.02
+            and ps.psnr(shown, ps.render(room, view)) > 40
+        )
 
 
 def test_keys_go_turn_and_lead_back(opened):
-    canvas, start = opened.find_element(By.TAG_NAME, "canvas"), camera(opened)
+    canvas = opened.find_element(By.TAG_NAME, "canvas")
+    start = camera(opened)
     opened.execute_script("flight.setDrag('look')")
     for key, axis, sign in (("w", "ahead", 1), ("a", "right", -1), ("e", "down", -1)):
         canvas.send_keys("r")
         hold(opened, key)
         moved = np.subtract(camera(opened)["eye"], start["eye"])
-        assert sign * moved @ start[axis] == pytest.approx(np.linalg.norm(moved), rel=1e-6) and np.abs(moved).max() > 0
+        assert (
+            sign * moved @ start[axis] == pytest.approx(np.linalg.norm(moved), rel=1e-6)
+            and np.abs(moved).max() > 0
+        )
     canvas.send_keys("r")
     hold(opened, Keys.ARROW_RIGHT)
     after = camera(opened)
@@ -137,7 +151,8 @@ def hold(browser, key: str) -> None:
 @pytest.mark.parametrize("drag", ["look", "orbit"])
 def test_drags_move_what_is_seen_with_the_pointer(opened, drag):
     opened.execute_script("flight.setDrag(arguments[0])", drag)
-    start, canvas = camera(opened), opened.find_element(By.TAG_NAME, "canvas")
+    start = camera(opened)
+    canvas = opened.find_element(By.TAG_NAME, "canvas")
     reach = opened.execute_script("return flight.camera.reach")
     pointer = ActionChains(opened).move_to_element_with_offset(canvas, 40, 20).click_and_hold()
     pointer.move_by_offset(20, 0).release().perform()
@@ -146,9 +161,16 @@ def test_drags_move_what_is_seen_with_the_pointer(opened, drag):
     if drag == "look":
         assert turn < 0 and after["eye"] == start["eye"], "the camera turns to the left"
     else:
-        middles = [np.add(state["eye"], np.multiply(reach, state["ahead"])) for state in (start, after)]
-        assert turn > 0 and np.allclose(*middles), "the camera goes to the left, about what is ahead"
-    level = [abs(np.dot(state["right"], opened.execute_script("return flight.camera.up"))) for state in (start, after)]
+        middles = [
+            np.add(state["eye"], np.multiply(reach, state["ahead"])) for state in (start, after)
+        ]
+        assert turn > 0 and np.allclose(*middles), (
+            "the camera goes to the left, about what is ahead"
+        )
+    level = [
+        abs(np.dot(state["right"], opened.execute_script("return flight.camera.up")))
+        for state in (start, after)
+    ]
     assert level[1] == pytest.approx(level[0], abs=1e-6), "the horizon stays level"
     settle(opened)
 

@@ -29,10 +29,16 @@ def levels(scene) -> Iterator[ViewedScene]:
 def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp_path, monkeypatch):
     ps.lod(scene, [1.0, 0.5, 0.1], folder=tmp_path / "room", stream=True)
     shown = []
-    monkeypatch.setattr("pointsplat_ns.pages.viewer.Viewer", lambda scenes, *rest: shown.extend(scenes))
+    monkeypatch.setattr(
+        "pointsplat_ns.pages.viewer.Viewer", lambda scenes, *rest: shown.extend(scenes)
+    )
     ps.open_viewer(tmp_path / "room")
     (made,) = shown
-    for percent, how in ((50, "level 1 of the stream"), (10, "level 2 of the stream"), (30, "chosen by coverage")):
+    for percent, how in (
+        (50, "level 1 of the stream"),
+        (10, "level 2 of the stream"),
+        (30, "chosen by coverage"),
+    ):
         level = made.at(percent)
         assert level.how == how and made.ready(percent) is (None if percent == 30 else level)
         assert len(level.scene) == pytest.approx(percent * len(made.scene) / 100, rel=0.1)
@@ -50,14 +56,17 @@ def test_a_share_is_there_at_once_by_coverage_and_then_merged(levels, scene):
 
 
 def test_merging_is_stopped_by_the_choice_of_another_share(levels, endless, monkeypatch):
-    (begun, _), found = endless, []
+    (begun, _) = endless
+    found = []
     page = threading.Thread(target=lambda: found.append(levels.merged(30)))
     page.start()
     assert begun.wait(30)
     levels.stop()
     page.join(30)
     assert found == [None] and levels.ready(30) is None
-    monkeypatch.setattr(module.Merger, "merged", lambda _, count, progress: SimpleNamespace(scene=ball(count)))
+    monkeypatch.setattr(
+        module.Merger, "merged", lambda _, count, progress: SimpleNamespace(scene=ball(count))
+    )
     assert len(levels.merged(10).scene) == 40
 
 
@@ -71,7 +80,9 @@ def test_failed_merging_leaves_what_was_chosen_and_says_why(levels, monkeypatch)
 
 
 def test_merged_levels_together_take_no_more_than_the_scene(levels, monkeypatch):
-    monkeypatch.setattr(module.Merger, "merged", lambda _, count, progress: SimpleNamespace(scene=ball(count)))
+    monkeypatch.setattr(
+        module.Merger, "merged", lambda _, count, progress: SimpleNamespace(scene=ball(count))
+    )
     for percent in (40, 50, 60):
         levels.merged(percent)
     assert [levels.ready(percent) is None for percent in (40, 50, 60)] == [True, True, False]

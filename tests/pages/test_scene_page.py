@@ -60,20 +60,36 @@ def test_scripts_of_one_page_declare_each_name_once():
 
 def test_texts_of_strangers_are_shown_and_never_run(tmp_path):
     scene = ball(50)
-    path = ps.write_page([scene, scene], tmp_path / "page.html", [HOSTILE, HOSTILE], title=HOSTILE, notes=[HOSTILE])
-    parts, text = parts_of(path), path.read_text("utf-8")
-    assert len(parts.inside["script"]) == 2 and all("onerror" not in attributes for _, attributes in parts.elements)
+    path = ps.write_page(
+        [scene, scene], tmp_path / "page.html", [HOSTILE, HOSTILE], title=HOSTILE, notes=[HOSTILE]
+    )
+    parts = parts_of(path)
+    text = path.read_text("utf-8")
+    assert len(parts.inside["script"]) == 2 and all(
+        "onerror" not in attributes for _, attributes in parts.elements
+    )
     assert [scene["name"] for scene in parts.data["flight"]["scenes"]] == [HOSTILE] * 2
     assert HOSTILE not in text and "<script>alert" not in text
 
 
 def test_too_large_a_page_leaves_the_larger_scene_out_and_says_so(written, rooms, tmp_path, caplog):
     both = written.stat().st_size / 1e6
-    path = ps.write_page(rooms, tmp_path / "less.html", ["dense", "compact"], views=room_views(), limit_mb=both - 0.01)
-    sentence = f"dense is left out: with it the page would have {both:.1f} MB, more than the {both - 0.01:g} MB allowed"
+    path = ps.write_page(
+        rooms,
+        tmp_path / "less.html",
+        ["dense", "compact"],
+        views=room_views(),
+        limit_mb=both - 0.01,
+    )
+    sentence = (
+        f"dense is left out: with it the page would have {both:.1f} MB, more than the "
+        f"{both - 0.01:g} MB allowed"
+    )
     assert f'<p class="note">{sentence}.</p>' in path.read_text("utf-8") and sentence in caplog.text
     assert [len(scene) for scene in scenes_in(path, tmp_path)] == [len(rooms[1])]
-    ps.write_page(rooms, path, ["dense", "compact"], title="room", views=room_views(), limit_mb=both + 0.01)
+    ps.write_page(
+        rooms, path, ["dense", "compact"], title="room", views=room_views(), limit_mb=both + 0.01
+    )
     assert path.read_bytes() == written.read_bytes()
 
 
@@ -81,14 +97,34 @@ def test_too_large_a_page_leaves_the_larger_scene_out_and_says_so(written, rooms
     "scenes, options, error, words",
     [
         ([], {}, ps.PointSplatError, "0 scenes for .*; expected one or two"),
-        ([ball(9)] * 2, {"names": ["one"]}, ps.PointSplatError, "1 names for 2 scenes; expected one for each"),
-        ([ball(9)], {"limit_mb": 0.01}, ps.PointSplatError, r"the page would have 0\.\d MB, more than the 0.01 MB"),
+        (
+            [ball(9)] * 2,
+            {"names": ["one"]},
+            ps.PointSplatError,
+            "1 names for 2 scenes; expected one for each",
+        ),
+        (
+            [ball(9)],
+            {"limit_mb": 0.01},
+            ps.PointSplatError,
+            r"the page would have 0\.\d MB, more than the 0.01 MB",
+        ),
         ([ball(9)], {"limit_mb": math.nan}, ps.PointSplatError, "a page of at most nan MB"),
-        ([ball(9).map(lambda v: v * math.nan)], {}, ps.SceneError, "none of the 9 Gaussians can be drawn"),
-        ([ball(9).replace(opacities=torch.full((9, 1), -math.inf))], {}, ps.DataError, "nothing .* can be seen"),
+        (
+            [ball(9).map(lambda v: v * math.nan)],
+            {},
+            ps.SceneError,
+            "none of the 9 Gaussians can be drawn",
+        ),
+        (
+            [ball(9).replace(opacities=torch.full((9, 1), -math.inf))],
+            {},
+            ps.DataError,
+            "nothing .* can be seen",
+        ),
         ([ball(9), ball(9)[:0]], {}, ps.SceneError, "holds no Gaussians that can be drawn"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_shown_is_refused_in_one_line(scenes, options, error, words, tmp_path):
     with pytest.raises(error, match=words) as caught:
         ps.write_page(scenes, tmp_path / "page.html", **options)
@@ -98,7 +134,9 @@ def test_what_cannot_be_shown_is_refused_in_one_line(scenes, options, error, wor
 def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_path, caplog):
     scene = ball(200)
     means = scene.means.clone()
-    means[3], means[7], means[9] = 1e6, math.nan, torch.tensor([0.0, -1e9, 0.0])
+    means[3] = 1e6
+    means[7] = math.nan
+    means[9] = torch.tensor([0.0, -1e9, 0.0])
     with caplog.at_level(logging.WARNING):
         path = ps.write_page(scene.replace(means=means), tmp_path / "page.html", ["the ball"])
     assert "the ball: 3 Gaussians, very far away or not finite, are not in the page" in caplog.text
@@ -109,7 +147,10 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
 def test_flight_begins_with_the_whole_and_leads_to_given_views():
     scene = ball(300)
     K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
-    viewmats = look_at(torch.tensor([[6.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), torch.tensor([[12.0, 0.0, 0.0], [0.0] * 3]))
+    viewmats = look_at(
+        torch.tensor([[6.0, 0.0, 0.0], [2.0, 0.0, 0.0]]),
+        torch.tensor([[12.0, 0.0, 0.0], [0.0] * 3]),
+    )
     views = ps.Views(viewmats, K, 64, 40, torch.tensor([1.0, 0.5, 0.0]), "antialiased")
     stage = FlightFrame.of(scene, views)
     data = stage.data([])
@@ -129,7 +170,9 @@ def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
     room = thinned(ps.example_room(), 1500)
     data = FlightFrame.of(room, views_from_within((0.0, 0.0, 1.3), 2, 48, 36)).data([])
     assert data["drag"] == "look" and len(data["views"]) == 2
-    upside_down = look_at(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.1]]), torch.tensor([0.0, 0.0, -1.0]))
+    upside_down = look_at(
+        torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.1]]), torch.tensor([0.0, 0.0, -1.0])
+    )
     K = torch.tensor([[[30.0, 0.0, 24.0], [0.0, 30.0, 18.0], [0.0, 0.0, 1.0]]])
     turned = FlightFrame.of(room, ps.Views(upside_down, K, 48, 36, torch.zeros(3)))
     assert turned.up.direction.tolist() == [0.0, 0.0, -1.0]
@@ -137,7 +180,8 @@ def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
 
 @pytest.mark.parametrize("content", [None, b"GIF89a", "cut", "wide"])
 def test_a_picture_that_cannot_be_used_is_none(tmp_path, content):
-    path, noise = tmp_path / "a.png", np.random.default_rng(3).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    path = tmp_path / "a.png"
+    noise = np.random.default_rng(3).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     Image.fromarray(noise).save(path)
     assert np.array_equal(read_png(path, 64, 48), noise)
     if content == "wide":

@@ -37,7 +37,9 @@ def answer(viewer: Viewer, method: str, path: str, body: bytes | None = None, **
     """What the viewer says to a request that any program may send: status, body and headers."""
     connection = http.client.HTTPConnection(viewer.url.removeprefix("http://"), timeout=30)
     connection.putrequest(method, path, skip_host="Host" in headers)
-    length = {} if body is None or "Content_Length" in headers else {"Content-Length": str(len(body))}
+    length = (
+        {} if body is None or "Content_Length" in headers else {"Content-Length": str(len(body))}
+    )
     for name, value in {**length, **headers}.items():
         connection.putheader(name.replace("_", "-"), value)
     connection.endheaders(body)
@@ -50,7 +52,9 @@ def post(viewer: Viewer, path: str, body: bytes, **headers: str):
     return answer(viewer, "POST", path, body, **{"Origin": viewer.url, **headers})
 
 
-def scene_at(viewer: Viewer, percent: int, have: str = "", **values: Any) -> tuple[int, bytes, dict[str, Any]]:
+def scene_at(
+    viewer: Viewer, percent: int, have: str = "", **values: Any
+) -> tuple[int, bytes, dict[str, Any]]:
     """The answer to a page that asks for its only scene at a share."""
     asked = {**ASKED, "percent": percent, "have": have, **values}
     status, body, headers = post(viewer, "/scene", json.dumps(asked).encode())
@@ -63,7 +67,10 @@ def test_page_is_served_and_asks_nobody_else(viewer):
     assert "default-src 'none'" in policy
     assert status == 200 and b"<html" in body and "connect-src 'self'" in policy
     assert b"http://" not in body and b"https://" not in body
-    assert headers["X-Frame-Options"] == "DENY" and headers["Cross-Origin-Resource-Policy"] == "same-origin"
+    assert (
+        headers["X-Frame-Options"] == "DENY"
+        and headers["Cross-Origin-Resource-Policy"] == "same-origin"
+    )
 
 
 @pytest.mark.parametrize(
@@ -96,11 +103,15 @@ WRONG = [{"scene": 1}, {"scene": -1}, {"percent": "x"}, {"percent": math.inf}]
 BODIES = [b"", b"[]", b"{", b"\xff", b'{"stage": 1}', b"[" * 1000]
 
 
-@pytest.mark.parametrize("body", [*BODIES, *(json.dumps({**ASKED, **wrong}).encode() for wrong in WRONG)])
+@pytest.mark.parametrize(
+    "body", [*BODIES, *(json.dumps({**ASKED, **wrong}).encode() for wrong in WRONG)]
+)
 def test_what_no_page_sends_is_refused_and_harms_nothing(body, viewer):
     assert post(viewer, "/scene", body)[0] == 400
     assert scene_at(viewer, 100)[0] == 200
-    assert post(viewer, "/scene", json.dumps({**ASKED, "stage": 2}).encode())[0] == 409, "another scene is shown"
+    assert post(viewer, "/scene", json.dumps({**ASKED, "stage": 2}).encode())[0] == 409, (
+        "another scene is shown"
+    )
 
 
 def test_a_dropped_scene_is_shown(empty, tmp_path):
@@ -133,23 +144,31 @@ HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999\nprope
         ("config.yml", b"!!python/object/apply:os.system [touch pwned]", "not a scene"),
     ],
 )
-def test_hostile_files_are_one_line_and_nothing_stays(name, data, words, empty, tmp_path, monkeypatch):
+def test_hostile_files_are_one_line_and_nothing_stays(
+    name, data, words, empty, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     status, body, headers = post(empty, f"/drop?name={quote(name)}", data)
     assert status == 422 and headers["Content-Type"].startswith("text/plain")
-    assert words in body.decode() and "\n" not in body.decode() and str(tmp_path) not in body.decode()
+    assert (
+        words in body.decode() and "\n" not in body.decode() and str(tmp_path) not in body.decode()
+    )
     assert list(tmp_path.iterdir()) == [], "no file is left, and none was made"
     assert b"Drop a file here" in answer(empty, "GET", "/")[1]
 
 
 def test_too_large_and_cut_off_files_are_refused(empty, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    status, body, _ = post(empty, "/drop?name=a.ply", b"x", Content_Length=str(viewing.LARGEST_FILE + 1))
+    status, body, _ = post(
+        empty, "/drop?name=a.ply", b"x", Content_Length=str(viewing.LARGEST_FILE + 1)
+    )
     assert status == 413 and b"expected at most 4,000,000,000" in body
     host, port = empty.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=30) as client:
-        request = f"POST /drop?name=a.ply HTTP/1.1\r\nHost: {host}:{port}\r\nOrigin: {empty.url}\r\n"
+        request = (
+            f"POST /drop?name=a.ply HTTP/1.1\r\nHost: {host}:{port}\r\nOrigin: {empty.url}\r\n"
+        )
         client.sendall(request.encode() + b"Content-Length: 100\r\n\r\nhalf")
         client.shutdown(socket.SHUT_WR)
         assert b" 400 " in client.recv(1000).partition(b"\r\n")[0] + b" "
@@ -158,7 +177,9 @@ def test_too_large_and_cut_off_files_are_refused(empty, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("host", "port"), [("192.0.2.1", 7007), ("no such host", 7007), ("127.0.0.1", 70000)])
+@pytest.mark.parametrize(
+    ("host", "port"), [("192.0.2.1", 7007), ("no such host", 7007), ("127.0.0.1", 70000)]
+)
 def test_places_that_cannot_be_listened_on_are_refused_in_one_line(host, port):
     with pytest.raises(ps.PointSplatError, match="expected") as raised:
         ps.open_viewer(host=host, port=port)
@@ -186,7 +207,10 @@ def test_kept_share_comes_at_once_then_merged_with_its_command(tmp_path):
     ps.save(ps.example_room()[::20], path)
     with ps.open_viewer(path, port=0) as viewer:
         status, first, state = scene_at(viewer, 20)
-        assert state["amount"] == "629 of 3,143 Gaussians, chosen by coverage, merging ..." and not state["whole"]
+        assert (
+            state["amount"] == "629 of 3,143 Gaussians, chosen by coverage, merging ..."
+            and not state["whole"]
+        )
         assert status == 200 and state["command"] == f"pointsplat prune '{path}' --keep 20%"
         assert scene_at(viewer, 20, spz=False)[:2] == (204, b"")
         status, body, state = scene_at(viewer, 20, state["how"])
@@ -202,7 +226,9 @@ def test_bodies_have_a_size_that_is_said_and_not_too_large(viewer):
     assert post(viewer, "/scene", b"x", Transfer_Encoding="chunked")[0] == 411
 
 
-@pytest.mark.parametrize("path", ["/../__init__.py", "/drop", "/spz.js", "/etc/passwd", "/%2e%2e/x", "/?/../../x"])
+@pytest.mark.parametrize(
+    "path", ["/../__init__.py", "/drop", "/spz.js", "/etc/passwd", "/%2e%2e/x", "/?/../../x"]
+)
 def test_only_the_routes_are_served(path, viewer):
     status, body, _ = answer(viewer, "GET", path)
     assert status == (200 if path.startswith("/?") else 404) and b"root:" not in body

@@ -16,7 +16,14 @@ def drawn(count: int = 6, width: int = 128, height: int = 96) -> list[np.ndarray
     """Smooth pictures that move."""
     y, x = np.mgrid[:height, :width]
     return [
-        np.stack([127 + 120 * np.sin(x / 20 + i), 127 + 120 * np.cos(y / 15), 127 + 99 * np.sin((x + y) / 30)], -1)
+        np.stack(
+            [
+                127 + 120 * np.sin(x / 20 + i),
+                127 + 120 * np.cos(y / 15),
+                127 + 99 * np.sin((x + y) / 30),
+            ],
+            -1,
+        )
         .round()
         .astype(np.uint8)
         for i in range(count)
@@ -28,13 +35,17 @@ def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float, force: bo
 
 
 def test_video_shows_the_frames_and_plays_everywhere(tmp_path):
-    """H.264 with 4:2:0, its colours named, its index in front, so that it starts before all of it has come."""
+    """H.264 with 4:2:0, its colours named, its index in front, so that it starts before all of it
+    has come."""
     import av
 
     frames = drawn()
     assert write_frames(frames, tmp_path / "film.mp4", 29.97) == 6
     shown = decoded(tmp_path / "film.mp4")
-    assert all(np.square(one - other.astype(float)).mean() < 65 for one, other in zip(shown, frames, strict=True))
+    assert all(
+        np.square(one - other.astype(float)).mean() < 65
+        for one, other in zip(shown, frames, strict=True)
+    )
     with av.open(str(tmp_path / "film.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")

@@ -1,4 +1,5 @@
-"""``pointsplat view`` as its user has it: a command that is started, a page in headless Chromium, Ctrl-C."""
+"""``pointsplat view`` as its user has it: a command that is started, a page in headless Chromium,
+Ctrl-C."""
 
 import base64
 import os
@@ -20,7 +21,9 @@ from pointsplat_ns.looking.upright import Up
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.webdriver.common.by import By  # noqa: E402
 
-pytestmark = pytest.mark.xdist_group("browser")  # one process starts Chromium for all tests of this file
+pytestmark = pytest.mark.xdist_group(
+    "browser"
+)  # one process starts Chromium for all tests of this file
 
 START = """
 import signal, sys
@@ -40,9 +43,13 @@ def program(browser, tmp_path_factory) -> Iterator[subprocess.Popen[str]]:
     words = ["view", *map(str, sorted(folder.iterdir())[::-1]), "--port", "0"]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     started = subprocess.Popen(
-        [sys.executable, "-c", START, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=environment, cwd=folder,
-    )  # fmt: skip
+        [sys.executable, "-c", START, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        cwd=folder,
+    )
     yield started
     started.kill()
     started.wait()
@@ -72,12 +79,17 @@ def still(browser) -> bool:
 def keep(browser, index: int, percent: int) -> None:
     """Move the slider of a scene."""
     script = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('input'))"
-    browser.execute_script(script, browser.find_elements(By.CSS_SELECTOR, "[data-kept]")[index], percent)
+    browser.execute_script(
+        script, browser.find_elements(By.CSS_SELECTOR, "[data-kept]")[index], percent
+    )
 
 
 def test_a_browser_without_webgl_or_its_floats_says_so(page):
     address = page.current_url
-    for owner, function in (("HTMLCanvasElement", "getContext"), ("WebGL2RenderingContext", "getExtension")):
+    for owner, function in (
+        ("HTMLCanvasElement", "getContext"),
+        ("WebGL2RenderingContext", "getExtension"),
+    ):
         with before_pages_load(page, f"{owner}.prototype.{function} = () => null;"):
             page.get(address)
             waited(lambda: "This browser offers no WebGL 2" in text_of(page), "what is missing")
@@ -118,7 +130,9 @@ def test_scene_is_chosen_or_dropped_and_shown(browser, tmp_path):
         browser.find_element(By.ID, "file").send_keys(str(tmp_path / "a room.spz"))
         waited(lambda: "a room.spz" in text_of(browser) and still(browser), "a picture")
         assert picture(browser).std() > 0.05
-        browser.execute_script(drop, base64.b64encode((tmp_path / "a room.spz").read_bytes()).decode())
+        browser.execute_script(
+            drop, base64.b64encode((tmp_path / "a room.spz").read_bytes()).decode()
+        )
         waited(lambda: "dropped.spz" in text_of(browser) and still(browser), "the dropped scene")
         said = [line for line in complaints(browser) if "422" not in line]
         assert said == []
@@ -144,7 +158,9 @@ def test_button_and_key_turn_through_all_axes_and_name_the_one_that_is_up(browse
         option = browser.find_element(By.CSS_SELECTOR, "[data-flight='option']").text
         assert named.text == f"up: {axis}" and option == f"--up={axis.removeprefix('+')}"
         level, up = browser.execute_script("return [flight.camera.right, flight.camera.up]")
-        assert abs(sum(a * b for a, b in zip(level, up, strict=True))) < 1e-6, "the horizon is level"
+        assert abs(sum(a * b for a, b in zip(level, up, strict=True))) < 1e-6, (
+            "the horizon is level"
+        )
         browser.execute_script("flight.goTo(1); flight.goTo(0)")
         assert browser.execute_script("return flight.camera.up") == up, "views stay turned"
         shown.append(picture(browser))

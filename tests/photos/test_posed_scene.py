@@ -28,7 +28,8 @@ def views(scene) -> ps.Views:
 
 
 def in_dataset(views: ps.Views, folder: Path) -> tuple[dict, str]:
-    """``transforms.json`` of cameras in the frame of a dataset, and the transforms that lead into the scene's."""
+    """``transforms.json`` of cameras in the frame of a dataset, and the transforms that lead into
+    the scene's."""
     poses = invert_rigid(views.viewmats.double())
     poses[:, :3, 3] *= 4
     poses[:, :3, 3] -= torch.tensor([1000.0, 0.0, 0.0])
@@ -46,13 +47,19 @@ def test_the_transforms_beside_scene_or_poses_are_applied(beside, scene, views, 
     ps.save(scene, tmp_path / "scene" / "room.ply")
     content, transforms = in_dataset(views, tmp_path)
     path = written(content, tmp_path / "poses" / "transforms.json")
-    with pytest.raises(ps.DataError, match=r"0 of 6 cameras see anything of the scene.*dataparser_transforms.json"):
+    with pytest.raises(
+        ps.DataError, match=r"0 of 6 cameras see anything of the scene.*dataparser_transforms.json"
+    ):
         read_found(tmp_path / "scene" / "room.ply", path)
     written(transforms, tmp_path / beside / "dataparser_transforms.json")
     dense, found, _ = read_found(tmp_path / "scene" / "room.ply", path)
     assert len(dense) == len(scene)
-    torch.testing.assert_close(found.viewmats.float(), views.viewmats.float(), rtol=0, atol=1e-3)  # of 1000 units
-    ps.save(scene.replace(means=scene.means + 1000), tmp_path / "scene" / "room.ply", overwrite=True)
+    torch.testing.assert_close(
+        found.viewmats.float(), views.viewmats.float(), rtol=0, atol=1e-3
+    )  # of 1000 units
+    ps.save(
+        scene.replace(means=scene.means + 1000), tmp_path / "scene" / "room.ply", overwrite=True
+    )
     with pytest.raises(ps.DataError, match="dataparser_transforms.json is of another run"):
         read_found(tmp_path / "scene" / "room.ply", path)
 
@@ -70,7 +77,9 @@ def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls
     for named in (run, run / "config.yml", next((run / "nerfstudio_models").glob("*.ckpt"))):
         dense, found, _ = read_found(named, path)
         assert dense.antialiased
-        torch.testing.assert_close(found.viewmats.float(), known.viewmats.float(), rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            found.viewmats.float(), known.viewmats.float(), rtol=0, atol=1e-5
+        )
 
 
 def turned_about(views: ps.Views) -> ps.Views:
@@ -99,7 +108,8 @@ def test_photos_that_lie_where_the_file_says_tell_a_wrong_frame(layout, scene, v
     _, found, _ = read_found(scene, poses_of(views))
     assert len(found) == len(views)
     with pytest.raises(
-        ps.DataError, match=r"no more like the photos of their views than like others \(.* dB PSNR in 6"
+        ps.DataError,
+        match=r"no more like the photos of their views than like others \(.* dB PSNR in 6",
     ):
         read_found(scene, poses_of(turned_about(views)))
     for photo in photos.iterdir():
@@ -118,18 +128,23 @@ def test_no_photo_outside_of_the_folder_of_poses_is_opened(scene, views, tmp_pat
 
 
 def rotation():
-    q, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
+    q, _ = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    )
     return q * torch.linalg.det(q).sign()
 
 
 def test_a_scene_that_is_moved_looks_the_same_from_cameras_that_move_along():
     scene = cloud(300, 4, 3).to(dtype=torch.float64)
     similarity = Similarity(rotation(), 2.5, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
-    views, inverse = ps.sample_views(scene, 2, width=48, height=36), similarity.inverse()
+    views = ps.sample_views(scene, 2, width=48, height=36)
+    inverse = similarity.inverse()
     viewmats = views.viewmats.clone()
     viewmats[:, :3, :3] = views.viewmats[:, :3, :3] @ inverse.matrix
     # The camera's axes keep their unit, so that depths grow with the scene.
-    viewmats[:, :3, 3] = similarity.scale * (views.viewmats[:, :3, :3] @ inverse.offset + views.viewmats[:, :3, 3])
+    viewmats[:, :3, 3] = similarity.scale * (
+        views.viewmats[:, :3, :3] @ inverse.offset + views.viewmats[:, :3, 3]
+    )
     moved = replace(views, viewmats=viewmats, near_plane=similarity.scale * views.near_plane)
     apart = ps.render(scene, views) - ps.render(similarity.apply(scene), moved)
     assert float(apart.abs().max()) < 1e-4  # the steps of blending are float32
@@ -157,7 +172,9 @@ def test_the_frame_of_a_run_is_undone(tmp_path):
     run = SimpleNamespace(folder=tmp_path, transform=transform, scale=0.125)
     data = cloud(40, 4)
     scene = run_frame(run).apply(data)  # what nerfstudio does to poses
-    expected = 0.125 * (data.means.double() @ transform[:, :3].double().T + transform[:, 3].double())
+    expected = 0.125 * (
+        data.means.double() @ transform[:, :3].double().T + transform[:, 3].double()
+    )
     assert torch.allclose(scene.means.double(), expected, atol=1e-5)
     assert torch.allclose(run_frame(run).inverse().apply(scene).means, data.means, atol=1e-5)
 
@@ -168,7 +185,8 @@ def test_the_frame_of_a_run_without_its_transforms_is_asked_for(trained_walls, t
     (run / "dataparser_transforms.json").unlink()
     for named in (run, run / "config.yml", next((run / "nerfstudio_models").glob("*.ckpt"))):
         with pytest.raises(
-            SceneError, match=r"run/dataparser_transforms.json: no such file.*copy it from the original"
+            SceneError,
+            match=r"run/dataparser_transforms.json: no such file.*copy it from the original",
         ):
             ps.place(ps.load(run), original_frame=named)
     with pytest.raises(SystemExit):
@@ -177,7 +195,9 @@ def test_the_frame_of_a_run_without_its_transforms_is_asked_for(trained_walls, t
 
 
 def test_a_transform_that_is_no_similarity_is_refused(tmp_path):
-    run = SimpleNamespace(folder=tmp_path, transform=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))[:3], scale=1.0)
+    run = SimpleNamespace(
+        folder=tmp_path, transform=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))[:3], scale=1.0
+    )
     with pytest.raises(SceneError, match="not a rotation with one scale"):
         run_frame(run)
 
@@ -186,7 +206,10 @@ def test_a_transform_that_is_no_similarity_is_refused(tmp_path):
     ("options", "message"),
     [
         *(({"up": up}, "expected an axis such as z") for up in ("w", "", "z:", "z:y:x", "north")),
-        *(({"scale": scale}, "expected a number above 0") for scale in (0.0, -1.0, math.nan, math.inf)),
+        *(
+            ({"scale": scale}, "expected a number above 0")
+            for scale in (0.0, -1.0, math.nan, math.inf)
+        ),
     ],
 )
 def test_an_axis_or_a_scale_that_is_none_is_refused(options, message):

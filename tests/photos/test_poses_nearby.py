@@ -37,15 +37,22 @@ def test_cameras_that_3dgs_training_wrote_are_used_and_named(place, scene, views
     assert same(known(path), views)
     assert f"poses: {tmp_path / 'cameras.json'}; --poses none" in said.text
     main(["prune", str(path), "--keep", "100", "--poses", "none"])
-    assert known(path, "none") is None and known(path.parent / path.name, str(tmp_path / "cameras.json")) is not None
+    assert (
+        known(path, "none") is None
+        and known(path.parent / path.name, str(tmp_path / "cameras.json")) is not None
+    )
 
 
 def test_poses_of_another_frame_are_not_used(scene, views, tmp_path, said):
     ps.save(scene, tmp_path / "room.ply")
     poses = invert_rigid(views.viewmats.double())
     poses[:, :3, 3] += 1000
-    (tmp_path / "cameras.json").write_text(json.dumps(inria(replace(views, viewmats=invert_rigid(poses)))))
-    assert known(tmp_path / "room.ply") is None and "cameras.json: not used for views: " in said.text
+    (tmp_path / "cameras.json").write_text(
+        json.dumps(inria(replace(views, viewmats=invert_rigid(poses))))
+    )
+    assert (
+        known(tmp_path / "room.ply") is None and "cameras.json: not used for views: " in said.text
+    )
 
 
 @pytest.mark.parametrize("kind", ["transforms.json", "colmap", "colmap above"])
@@ -58,11 +65,17 @@ def test_poses_of_data_count_where_photos_tell_that_they_belong(kind, scene, vie
         (tmp_path / kind).write_text(json.dumps(nerfstudio(views)))
     else:
         write_sparse(views, tmp_path / "sparse" / "0")
-    assert known(path) is None and "no photos beside it tell whether it belongs to the scene" in said.text
+    assert (
+        known(path) is None
+        and "no photos beside it tell whether it belongs to the scene" in said.text
+    )
     write_photos(scene, views, tmp_path / "images")
     assert same(known(path), views)
     write_photos(scene, views[torch.arange(len(views)).flip(0).tolist()], tmp_path / "images")
-    assert known(path) is None and "no more like the photos of their views than like others" in said.text
+    assert (
+        known(path) is None
+        and "no more like the photos of their views than like others" in said.text
+    )
 
 
 def test_damaged_files_beside_a_scene_stop_nothing(scene, tmp_path, said):

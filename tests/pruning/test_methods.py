@@ -55,7 +55,9 @@ def test_a_score_keeps_the_k_highest_bit_for_bit_and_in_order(by, keep, k):
     scene = normal_scene(50, 1)
     scene.quats[:, 0] = -0.0
     scene.opacities[::7] = math.inf
-    pruned, indices, scores = prune(scene, keep, by), kept(scene, keep, by), score_of(scene, METHODS[by])
+    pruned = prune(scene, keep, by)
+    indices = kept(scene, keep, by)
+    scores = score_of(scene, METHODS[by])
     assert len(pruned) == k and len(indices) == k and scores.shape == (50,)
     assert (indices.diff() > 0).all()
     assert same_bits(pruned, scene[indices])
@@ -89,7 +91,10 @@ def test_a_scene_with_no_gaussian_or_none_that_can_be_drawn_is_refused(by):
     ("by", "options", "message"),
     [
         ("best", {}, UNKNOWN),
-        *((by, {"views": None}, f"{by} looks at the scene from poses; expected views") for by in WITH_VIEWS),
+        *(
+            (by, {"views": None}, f"{by} looks at the scene from poses; expected views")
+            for by in WITH_VIEWS
+        ),
         *(
             (by, {"opacity_weight": 0.5}, f"{by} does not weigh opacity; .* one of paper, authors$")
             for by in WITHOUT_OPACITY_WEIGHT
@@ -117,7 +122,10 @@ def test_settings_prune_as_prune_does(keep, count):
             ({"keep": keep}, "expected a ratio above 0 and up to 1 .* or a whole")
             for keep in (0, -1, 1.5, 7.25, math.nan)
         ),
-        *(({"by": by}, f"{by} looks at a scene from poses; expected a method that needs none") for by in WITH_VIEWS),
+        *(
+            ({"by": by}, f"{by} looks at a scene from poses; expected a method that needs none")
+            for by in WITH_VIEWS
+        ),
         ({"by": "best"}, UNKNOWN),
         ({"opacity_weight": 0.5}, "merge does not weigh opacity; .* one of paper, authors$"),
     ],
@@ -169,7 +177,9 @@ def test_a_budget_that_fits_no_count_of_the_scene_is_refused(n, keep, message):
 @pytest.mark.parametrize("kind", [Megabytes, WithinPsnr])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_a_size_or_a_psnr_is_positive(kind, value):
-    with pytest.raises(BudgetError, match="keep is .*MB; expected|the wanted PSNR is .* dB; expected a pos"):
+    with pytest.raises(
+        BudgetError, match="keep is .*MB; expected|the wanted PSNR is .* dB; expected a pos"
+    ):
         kind(value)
 
 
@@ -180,7 +190,10 @@ def test_a_size_or_a_psnr_is_positive(kind, value):
         ("30%", 0.3),
         ("1", 1),
         (" 50000 ", 50000),
-        *((text, 1000) for text in ("1e3", "1k", "1,000", "0.001M", "1000 Gaussians", "1kgaussians", "1.0e3")),
+        *(
+            (text, 1000)
+            for text in ("1e3", "1k", "1,000", "0.001M", "1000 Gaussians", "1kgaussians", "1.0e3")
+        ),
         ("12kb", Megabytes(0.012)),
         ("5,000 B", Megabytes(0.005)),
         ("1.5 MB.sog", Megabytes(1.5, ".sog")),
@@ -198,7 +211,12 @@ def test_a_typed_budget_keeps_its_kind(text, keep):
 
 
 def test_few_gaussians_of_many_are_asked_about_unless_they_are_called_so():
-    for n, text, kept in ((5000, "10%", 500), (5000, "10gaussians", 10), (4999, "10", 10), (5000, "100", 100)):
+    for n, text, kept in (
+        (5000, "10%", 500),
+        (5000, "10gaussians", 10),
+        (4999, "10", 10),
+        (5000, "100", 100),
+    ):
         assert resolve_keep(n, text) == kept
     assert resolve_keep(5000, 10) == 10
     wanted = r"keep is 10, of 5,000 Gaussians; did you mean 10%\? Write 10gaussians for so few"
@@ -207,7 +225,8 @@ def test_few_gaussians_of_many_are_asked_about_unless_they_are_called_so():
 
 
 @pytest.mark.parametrize(
-    "text", ["", "0.5 gaussians", *"half % 1,00 0,3 0.3x MB xMB 12TB 1e999 auto: auto:x automatic".split()]
+    "text",
+    ["", "0.5 gaussians", *"half % 1,00 0,3 0.3x MB xMB 12TB 1e999 auto: auto:x automatic".split()],
 )
 def test_a_typed_budget_that_is_none_is_refused(text):
     with pytest.raises(BudgetError, match="expected a ratio"):

@@ -14,7 +14,9 @@ from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 def test_energies_are_mean_squares_over_the_sphere_and_lost_shares_add_up():
     scene = normal_scene(20).to(torch.float64)
     generator = torch.Generator().manual_seed(1)
-    directions = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=generator, dtype=torch.float64), dim=1)
+    directions = torch.nn.functional.normalize(
+        torch.randn(20_000, 3, generator=generator, dtype=torch.float64), dim=1
+    )
     basis = sh_basis(directions, 3)
     area = scene.stds.sort(dim=1).values[:, 1:].prod(dim=1)
     weights = scene.alphas * area / (scene.alphas * area).sum()
@@ -37,7 +39,9 @@ def test_cutting_leaves_the_rest_bit_for_bit(degree):
         assert torch.equal(ours, whole[:, : ours.shape[1]]), name
 
 
-@pytest.mark.parametrize("case", ["empty", "no colour", "invisible", "nan", "huge scales", "larger scales", "degree 0"])
+@pytest.mark.parametrize(
+    "case", ["empty", "no colour", "invisible", "nan", "huge scales", "larger scales", "degree 0"]
+)
 def test_where_there_is_nothing_to_lose_nothing_is_lost(case):
     scene = normal_scene(20)
     scene = {
@@ -46,7 +50,9 @@ def test_where_there_is_nothing_to_lose_nothing_is_lost(case):
         "invisible": lambda: scene.replace(opacities=torch.full_like(scene.opacities, -math.inf)),
         "nan": lambda: scene.map(lambda value: value * math.nan),
         "huge scales": lambda: scene.replace(scales=torch.full_like(scene.scales, 88.0)),
-        "larger scales": lambda: scene.replace(scales=torch.full_like(scene.scales, 1e4)),  # are not drawn
+        "larger scales": lambda: scene.replace(
+            scales=torch.full_like(scene.scales, 1e4)
+        ),  # are not drawn
         "degree 0": lambda: normal_scene(20, 0),
     }[case]()
     lost = energy_lost(scene, 0)

@@ -11,15 +11,18 @@ from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.system.kernels import KERNELS
 
-F32, F64 = torch.float32, torch.float64
-WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
+F32 = torch.float32
+F64 = torch.float64
+# neither is a multiple of the tile
+WIDTH = 70
+HEIGHT = 45
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
 
 def draw(channels=3, n=3000, cameras=1, focal=50.0, **options):
-    """Image, alphas, gradients and absolute gradients of random Gaussians of every opacity, some of them opaque; SH
-    coefficients in place of channels where ``sh_degree`` is given."""
+    """Image, alphas, gradients and absolute gradients of random Gaussians of every opacity, some of
+    them opaque; SH coefficients in place of channels where ``sh_degree`` is given."""
     *shape, sh = splats_in_view(n, seed=2, scale=-2.5, opacity=1.3, dtype=F64)
     shape[3].clamp_(max=1.0)
     colors = sh if "sh_degree" in options else torch.cat([sh[:, 0], sh[:, 1]], dim=1)[:, :channels]
@@ -66,7 +69,9 @@ def test_images_and_gradients_are_those_of_torch(options, monkeypatch):
 @needs_compiler
 def test_any_number_of_threads_draws_the_same_bits():
     assert_same_on_any_threads(
-        lambda: draw(n=5000, sh_degree=3, rasterize_mode="antialiased", memory_budget=400_000, compiled=True)
+        lambda: draw(
+            n=5000, sh_degree=3, rasterize_mode="antialiased", memory_budget=400_000, compiled=True
+        )
     )
 
 
@@ -74,7 +79,8 @@ def test_any_number_of_threads_draws_the_same_bits():
 
 
 def inputs(stored=17, n=500, m=300):
-    """Directions (M, 3) of any length, one of them zero, coefficients (N, K, 3), and rows in no order."""
+    """Directions (M, 3) of any length, one of them zero, coefficients (N, K, 3), and rows in no
+    order."""
     g = torch.Generator().manual_seed(5)
     directions = torch.randn(m, 3, generator=g) * 10.0 ** torch.linspace(-20, 20, m)[:, None]
     directions[7] = 0
@@ -83,12 +89,15 @@ def inputs(stored=17, n=500, m=300):
 
 
 def colored(directions, coefficients, ids, degree, dtype, compiled):
-    """Colours, and the gradients of a fixed sum of them, in float64; those of directions by unit of their length."""
+    """Colours, and the gradients of a fixed sum of them, in float64; those of directions by unit of
+    their length."""
     leaves = [t.to(dtype, copy=True).requires_grad_() for t in (directions, coefficients)]
     colors = sh_to_color(leaves[0], leaves[1][:, 0], leaves[1][:, 1:], degree, ids, compiled)
     weights = torch.randn(colors.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
     grads = torch.autograd.grad((colors * weights).sum(), leaves, allow_unused=True)
-    of_directions = None if grads[0] is None else grads[0].double() * directions.norm(dim=1, keepdim=True)
+    of_directions = (
+        None if grads[0] is None else grads[0].double() * directions.norm(dim=1, keepdim=True)
+    )
     return colors.detach().double(), of_directions, grads[1].double()
 
 
@@ -97,7 +106,9 @@ def colored(directions, coefficients, ids, degree, dtype, compiled):
 @pytest.mark.parametrize("degree", range(4))
 def test_colours_and_gradients_are_those_of_torch_and_as_near_to_float64(degree, extra):
     given = inputs(stored=(degree + 1) ** 2 + extra)
-    ours, torchs, exact = (colored(*given, degree, *how) for how in ((F32, True), (F32, False), (F64, False)))
+    ours, torchs, exact = (
+        colored(*given, degree, *how) for how in ((F32, True), (F32, False), (F64, False))
+    )
     assert (ours[0] == 0).any() and (ours[0] > 0).any()
     assert (ours[1] is None) == (torchs[1] is None) == (degree == 0)  # a constant has no direction
     for mine, theirs, right in zip(ours, torchs, exact, strict=True):
@@ -112,7 +123,13 @@ def test_colours_and_gradients_are_those_of_torch_and_as_near_to_float64(degree,
 @needs_compiler
 def test_rows_of_no_gaussian_are_refused_before_memory_is_read():
     directions, coefficients, ids = (t.float() if t.is_floating_point() else t for t in inputs())
-    assert sh_to_color(directions[:0], coefficients[:, 0], coefficients[:, 1:], 3, ids[:0]).shape == (0, 3)
+    assert sh_to_color(
+        directions[:0], coefficients[:, 0], coefficients[:, 1:], 3, ids[:0]
+    ).shape == (0, 3)
     for wrong in (-1, len(coefficients)):
-        with pytest.raises(IndexError, match=f"ids are from .*{wrong}.*expected rows of 500 Gaussians"):
-            sh_to_color(directions[:2], coefficients[:, 0], coefficients[:, 1:], 3, torch.tensor([3, wrong]))
+        with pytest.raises(
+            IndexError, match=f"ids are from .*{wrong}.*expected rows of 500 Gaussians"
+        ):
+            sh_to_color(
+                directions[:2], coefficients[:, 0], coefficients[:, 1:], 3, torch.tensor([3, wrong])
+            )

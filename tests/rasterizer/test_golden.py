@@ -23,4 +23,8 @@ if torch.cuda.is_available():
 @pytest.mark.parametrize("dtype", golden.TOLERANCES)
 @pytest.mark.parametrize("name", golden.SCENES)
 def test_every_path_draws_what_the_reference_draws(name, dtype, options):
-    golden.compare(golden.drawn(name, dtype, **options), golden.drawn_by_reference(name), *golden.TOLERANCES[dtype])
+    golden.compare(
+        golden.drawn(name, dtype, **options),
+        golden.drawn_by_reference(name),
+        *golden.TOLERANCES[dtype],
+    )

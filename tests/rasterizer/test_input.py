@@ -13,10 +13,21 @@ F64 = torch.float64
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
 BAD = [
-    ("means", math.nan), ("means", math.inf), ("means", -math.inf), ("quats", math.nan), ("quats", math.inf),
-    ("scales", math.nan), ("scales", math.inf), ("scales", -0.1), ("opacities", math.nan), ("opacities", math.inf),
-    ("opacities", -0.5), ("colors", math.nan), ("colors", math.inf), ("colors", -math.inf),
-]  # fmt: skip
+    ("means", math.nan),
+    ("means", math.inf),
+    ("means", -math.inf),
+    ("quats", math.nan),
+    ("quats", math.inf),
+    ("scales", math.nan),
+    ("scales", math.inf),
+    ("scales", -0.1),
+    ("opacities", math.nan),
+    ("opacities", math.inf),
+    ("opacities", -0.5),
+    ("colors", math.nan),
+    ("colors", math.inf),
+    ("colors", -math.inf),
+]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
@@ -28,15 +39,21 @@ def test_what_has_no_meaning_is_skipped_and_counted_with_a_zero_gradient(dtype, 
     view, K = (t.to(dtype)[None] for t in camera_askew())
     scene[3] = scene[3].clamp_min(0.1)
     scene[0][:, :2] *= 0.2  # all in sight
-    clean, clean_alpha, meta = rasterization(*[t[len(BAD) :] for t in scene], view, K, 37, 29, sh_degree=sh_degree)
+    clean, clean_alpha, meta = rasterization(
+        *[t[len(BAD) :] for t in scene], view, K, 37, 29, sh_degree=sh_degree
+    )
     assert meta["skipped"] == 0
     for row, (name, value) in enumerate(BAD):
         scene[NAMES.index(name)][row].view(-1)[0] = value
     leaves = [t.clone().requires_grad_() for t in (*scene, view)]
-    image, alpha, meta = rasterization(*leaves, K, 37, 29, sh_degree=sh_degree, render_mode="RGB+ED")
+    image, alpha, meta = rasterization(
+        *leaves, K, 37, 29, sh_degree=sh_degree, render_mode="RGB+ED"
+    )
     assert meta["skipped"] == len(BAD)
     tolerance = 1e-12 if dtype == F64 else 1e-5  # another order of the same sums
-    assert (image[..., :-1] - clean).abs().max() < tolerance and (alpha - clean_alpha).abs().max() < tolerance
+    assert (image[..., :-1] - clean).abs().max() < tolerance and (
+        alpha - clean_alpha
+    ).abs().max() < tolerance
     *grads, grad_view = torch.autograd.grad(image.sum() + alpha.sum(), leaves)
     assert grad_view.isfinite().all() and grad_view.any()
     for name, grad in zip(NAMES, grads, strict=True):
@@ -53,7 +70,9 @@ def test_half_precision_input_is_drawn_in_float32(dtype):
     half = [t.to(dtype).requires_grad_() for t in scene]
     got, _, meta = rasterization(*half, view.to(dtype).float(), K, 37, 29, sh_degree=3)
     assert got.dtype == torch.float32 and meta["skipped"] == 0
-    exact, _, _ = rasterization(*[t.detach().float() for t in half], view.to(dtype).float(), K, 37, 29, sh_degree=3)
+    exact, _, _ = rasterization(
+        *[t.detach().float() for t in half], view.to(dtype).float(), K, 37, 29, sh_degree=3
+    )
     assert got.any() and torch.equal(got, exact)
     for grad, leaf in zip(torch.autograd.grad(got.mean(), half), half, strict=True):
         assert grad.dtype == leaf.dtype == dtype and grad.isfinite().all() and grad.any()

@@ -12,7 +12,8 @@ from pointsplat_ns.rasterizer import scene as drawing
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.views import View
 
-WIDTH, HEIGHT = 67, 43
+WIDTH = 67
+HEIGHT = 43
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
@@ -26,7 +27,14 @@ def scene_of(degree=3, count=1500):
 
 def view_of(mode="classic"):
     K = torch.tensor([[50.0, 0.0, 30.0], [0.0, 52.0, 24.0], [0.0, 0.0, 1.0]])
-    return View(torch.eye(4).double(), K, WIDTH, HEIGHT, rasterize_mode=mode, background=torch.tensor([0.2, 0.5, 0.9]))
+    return View(
+        torch.eye(4).double(),
+        K,
+        WIDTH,
+        HEIGHT,
+        rasterize_mode=mode,
+        background=torch.tensor([0.2, 0.5, 0.9]),
+    )
 
 
 def _far(scene, view):
@@ -34,11 +42,15 @@ def _far(scene, view):
     means = (scene.means * 64 + shift).float()
     viewmat = view.viewmat.clone()
     viewmat[:3, 3] = -shift
-    return scene.replace(means=means, scales=scene.scales + math.log(64)), replace(view, viewmat=viewmat)
+    return scene.replace(means=means, scales=scene.scales + math.log(64)), replace(
+        view, viewmat=viewmat
+    )
 
 
 def _needles(scene, view):
-    return scene.replace(scales=torch.tensor([0.0, -9.0, -9.0]).expand(len(scene), 3).contiguous()), view
+    return scene.replace(
+        scales=torch.tensor([0.0, -9.0, -9.0]).expand(len(scene), 3).contiguous()
+    ), view
 
 
 def _large_and_tiny(scene, view):
@@ -68,16 +80,22 @@ CHANGES = [_far, _needles, _large_and_tiny, _meaningless, _at_one_depth]
 @needs_compiler
 @torch.no_grad()
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-@pytest.mark.parametrize("change", [None, *CHANGES], ids=lambda change: change.__name__ if change else "ordinary")
+@pytest.mark.parametrize(
+    "change", [None, *CHANGES], ids=lambda change: change.__name__ if change else "ordinary"
+)
 def test_pictures_and_pixels_are_those_of_torch(change, mode):
-    scene, view = scene_of(), view_of(mode)
+    scene = scene_of()
+    view = view_of(mode)
     scene, view = change(scene, view) if change else (scene, view)
     assert pictures.can_draw(scene, None) and not pictures.can_draw(scene.to(torch.float64), None)
     image, alpha = drawing.render_with_alpha(scene, view)
-    wanted, wanted_alpha = drawing.render_with_alpha(scene.to(torch.float64), view)  # which torch draws
+    wanted, wanted_alpha = drawing.render_with_alpha(
+        scene.to(torch.float64), view
+    )  # which torch draws
     wanted_pixels = pixels_of(scene.to(torch.float64), view)
     assert wanted_alpha.any()
-    # float32 against float64: a pixel at the threshold of 1/255 may fall either way, and then differs by so much
+    # float32 against float64: a pixel at the threshold of 1/255 may fall either way, and then
+    # differs by so much
     for ours, torchs in ((image, wanted), (alpha, wanted_alpha)):
         off = (ours - torchs).abs()
         assert off.max() < 1.5 / 255 and (off > 1e-4).float().mean() < 0.01
@@ -91,8 +109,10 @@ def test_pictures_and_pixels_are_those_of_torch(change, mode):
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("quality", ["exact", "balanced", "fast"])
 def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monkeypatch):
-    scene, view = scene_of(degree), view_of()
-    at_once, pixels = drawing.render_with_alpha(scene, view, quality), pixels_of(scene, view)
+    scene = scene_of(degree)
+    view = view_of()
+    at_once = drawing.render_with_alpha(scene, view, quality)
+    pixels = pixels_of(scene, view)
     monkeypatch.setattr(pictures, "MOST_PAIRS", 10)  # as a picture of too many pairs is drawn
     for ours, others in zip(at_once, drawing.render_with_alpha(scene, view, quality), strict=True):
         torch.testing.assert_close(ours, others, rtol=0, atol=1e-6)
@@ -102,8 +122,11 @@ def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monk
 @needs_compiler
 @torch.no_grad()
 def test_pictures_are_the_same_on_any_threads():
-    scene, view = scene_of(count=12_000), view_of()
-    assert_same_on_any_threads(lambda: [*drawing.render_with_alpha(scene, view), pixels_of(scene, view)])
+    scene = scene_of(count=12_000)
+    view = view_of()
+    assert_same_on_any_threads(
+        lambda: [*drawing.render_with_alpha(scene, view), pixels_of(scene, view)]
+    )
     assert_same_on_any_threads(lambda: gradients(scene, view))
 
 
@@ -119,11 +142,15 @@ def gradients(scene, view, only=slice(None)):
 
 @needs_compiler
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-@pytest.mark.parametrize("change", [None, *CHANGES], ids=lambda change: change.__name__ if change else "ordinary")
+@pytest.mark.parametrize(
+    "change", [None, *CHANGES], ids=lambda change: change.__name__ if change else "ordinary"
+)
 def test_gradients_are_those_of_torch_and_as_near_to_float64(change, mode, monkeypatch):
-    scene, view = scene_of(), view_of(mode)
+    scene = scene_of()
+    view = view_of(mode)
     scene, view = change(scene, view) if change else (scene, view)
-    ours, exact = gradients(scene, view), gradients(scene.to(torch.float64), view)
+    ours = gradients(scene, view)
+    exact = gradients(scene.to(torch.float64), view)
     monkeypatch.setattr(pictures, "can_draw", lambda *_: False)
     general = gradients(scene, view)
     for got, others, wanted in zip(ours, general, exact, strict=True):
@@ -136,7 +163,8 @@ def test_gradients_are_those_of_torch_and_as_near_to_float64(change, mode, monke
 @needs_compiler
 @pytest.mark.parametrize("degree", range(4))
 def test_a_gradient_alone_is_as_among_others_and_of_many_pairs_as_of_few(degree, monkeypatch):
-    scene, view = scene_of(degree), view_of()
+    scene = scene_of(degree)
+    view = view_of()
     found = gradients(scene, view)
     for which, wanted in enumerate(found):
         assert torch.equal(gradients(scene, view, slice(which, which + 1))[0], wanted)
@@ -165,7 +193,8 @@ def test_a_scene_that_changes_before_its_gradient_is_refused():
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_of_no_gaussians_the_background_is_drawn(count):
-    scene, view = scene_of(1, 1)[:count], view_of()
+    scene = scene_of(1, 1)[:count]
+    view = view_of()
     scene = scene.replace(means=scene.means - 50.0)  # behind the camera, if there is one
     assert torch.equal(render(scene, view), view.background.expand(HEIGHT, WIDTH, 3))
     assert pixels_of(scene, view).tolist() == [0.0] * count

@@ -13,16 +13,26 @@ from pointsplat_ns.refiner.augmentation import Transform, random_transform
 def a_scene(n=40, sh_degree=3, dtype=torch.float64, seed=0):
     scene = normal_scene(n, sh_degree, seed, dtype)
     return scene.replace(
-        scales=0.5 * scene.scales - 2, features_dc=0.3 * scene.features_dc, features_rest=0.1 * scene.features_rest
+        scales=0.5 * scene.scales - 2,
+        features_dc=0.3 * scene.features_dc,
+        features_rest=0.1 * scene.features_rest,
     )
 
 
 def picture(scene, viewmat):
     K = torch.tensor([[40.0, 0, 24], [0, 40.0, 24], [0, 0, 1]], dtype=scene.dtype)
     image, alpha, _ = rasterization(
-        scene.means, scene.quats, scene.stds, scene.alphas, scene.sh, viewmat[None], K[None], 48, 48,
+        scene.means,
+        scene.quats,
+        scene.stds,
+        scene.alphas,
+        scene.sh,
+        viewmat[None],
+        K[None],
+        48,
+        48,
         sh_degree=scene.sh_degree,
-    )  # fmt: skip
+    )
     return image[0], alpha[0]
 
 
@@ -43,9 +53,11 @@ def test_a_turned_scene_looks_the_same_to_a_turned_camera():
     viewmat[2, 3] = 6.0
     turned = viewmat.clone()
     turned[:3, :3] = viewmat[:3, :3] @ turn.matrix.T
-    before, after = picture(scene, viewmat), picture(turn.apply(scene), turned)
+    before = picture(scene, viewmat)
+    after = picture(turn.apply(scene), turned)
     for a, b in zip(before, after, strict=True):
-        # A pixel at a threshold of alpha may fall on the other side of it by rounding: 1/255 of it then shows.
+        # A pixel at a threshold of alpha may fall on the other side of it by rounding: 1/255 of it
+        # then shows.
         assert (a - b).abs().max() < 5e-3
         assert (a - b).abs().mean() < 1e-5
 

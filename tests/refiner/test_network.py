@@ -9,9 +9,21 @@ import torch.nn.functional as F
 from making import move_zero_layers, normal_scene
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import Refiner, preset, sparse_ops
-from pointsplat_ns.refiner.network import BatchNorm, Block, PatchAttention, SceneNorm, SubmanifoldConv
+from pointsplat_ns.refiner.network import (
+    BatchNorm,
+    Block,
+    PatchAttention,
+    SceneNorm,
+    SubmanifoldConv,
+)
 from pointsplat_ns.refiner.refiner import canonical_quats, gaussian_features
-from pointsplat_ns.refiner.sparse_ops import by_patches, permute, segment_max, segment_mean, submanifold_conv
+from pointsplat_ns.refiner.sparse_ops import (
+    by_patches,
+    permute,
+    segment_max,
+    segment_mean,
+    submanifold_conv,
+)
 from pointsplat_ns.refiner.structure import build_structure, neighbour_pairs, unit_cube
 
 
@@ -19,7 +31,8 @@ from pointsplat_ns.refiner.structure import build_structure, neighbour_pairs, un
 def test_quaternions_of_any_length_become_unit_and_are_recovered(length):
     q = torch.randn(100, 4, generator=torch.Generator().manual_seed(0)).clamp(-1.6, 1.6) * length
     unit, scale = canonical_quats(q)
-    # A few float32 roundings; those of the smallest components of the shortest are subnormal, multiples of 1.4e-45.
+    # A few float32 roundings; those of the smallest components of the shortest are subnormal,
+    # multiples of 1.4e-45.
     assert torch.allclose(unit.norm(dim=1), torch.ones(100), atol=5e-7)
     assert torch.allclose(unit * scale, q, rtol=5e-7, atol=1e-44)
 
@@ -29,15 +42,21 @@ def test_features_of_extreme_parameters_are_finite_and_bounded(raw, most):
     n = 6
     inf = torch.inf
     scene = Gaussians(
-        means=torch.tensor([[0.0, 0, 0], [1, 1, 1], [1e6, 0, 0], [0, -1e6, 0], [2, 2, 2], [3, 3, 3]]),
+        means=torch.tensor(
+            [[0.0, 0, 0], [1, 1, 1], [1e6, 0, 0], [0, -1e6, 0], [2, 2, 2], [3, 3, 3]]
+        ),
         scales=torch.tensor([80.0, -80, -inf, 0, -5, 88])[:, None].expand(n, 3).clone(),
-        quats=torch.tensor([[0.0, 0, 0, 0], [1e30, 0, 0, 0], [1e-30, 0, 0, -1e-30], [1, 1, 1, 1]] * 2)[:n],
+        quats=torch.tensor(
+            [[0.0, 0, 0, 0], [1e30, 0, 0, 0], [1e-30, 0, 0, -1e-30], [1, 1, 1, 1]] * 2
+        )[:n],
         opacities=torch.tensor([inf, -inf, 40, -40, 0, 1])[:, None],
         features_dc=torch.full((n, 3), 1e30),
         features_rest=torch.full((n, 3, 3), -1e30),
     )
     scene = scene.map(lambda value: value.clone().requires_grad_())
-    features = gaussian_features(scene, unit_cube(scene.means), num_rest=15, dtype=torch.float32, raw=raw)
+    features = gaussian_features(
+        scene, unit_cube(scene.means), num_rest=15, dtype=torch.float32, raw=raw
+    )
     total = 0
     for name in ("positions", "quats", "scales", "opacities", "features_dc", "features_rest"):
         value = getattr(features, name)
@@ -55,11 +74,16 @@ def test_raw_features_are_the_numbers_of_the_scene_in_a_unit_cube():
     cube = unit_cube(scene.means)
     features = gaussian_features(scene, cube, num_rest=15, dtype=torch.float32, raw=True)
     assert torch.allclose(features.scales, scene.scales - cube.extent.float().log(), atol=1e-5)
-    assert torch.equal(features.opacities, scene.opacities) and torch.equal(features.features_dc, scene.features_dc)
+    assert torch.equal(features.opacities, scene.opacities) and torch.equal(
+        features.features_dc, scene.features_dc
+    )
     usual = gaussian_features(scene, cube, num_rest=15, dtype=torch.float32)
     assert torch.allclose(features.scales, 2 * usual.scales - 5, atol=1e-5)
-    assert torch.equal(features.positions, usual.positions) and torch.equal(features.quats, usual.quats)
-    seen, refiner = [], Refiner(preset("tiny", raw_inputs=True)).eval()
+    assert torch.equal(features.positions, usual.positions) and torch.equal(
+        features.quats, usual.quats
+    )
+    seen = []
+    refiner = Refiner(preset("tiny", raw_inputs=True)).eval()
     refiner.encoder.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
     refiner(scene)
     assert torch.equal(seen[0].opacities.sort(dim=0).values, features.opacities.sort(dim=0).values)
@@ -81,14 +105,19 @@ def plain_attention(module: PatchAttention, x: torch.Tensor) -> torch.Tensor:
 def test_patches_attend_within_themselves_and_the_last_borrows(n, patch):
     torch.manual_seed(0)
     module = PatchAttention(12, 3, patch).double()
-    x, order = torch.randn(n, 12, dtype=torch.float64), torch.randperm(n)
+    x = torch.randn(n, 12, dtype=torch.float64)
+    order = torch.randperm(n)
     for along in (None, order):
         inner = x if along is None else x[along]
         whole = [plain_attention(module, part) for part in inner.split(patch)]
         if n % patch and n > patch:
             whole[-1] = plain_attention(module, inner[n - patch :])[-(n % patch) :]
-        found = by_patches(module, x, 36, patch, None if along is None else (along, along.argsort()))
-        assert torch.allclose(found if along is None else found[along], torch.cat(whole), atol=1e-12)
+        found = by_patches(
+            module, x, 36, patch, None if along is None else (along, along.argsort())
+        )
+        assert torch.allclose(
+            found if along is None else found[along], torch.cat(whole), atol=1e-12
+        )
 
 
 def test_points_of_a_cell_get_the_dense_convolution_of_their_mean():
@@ -102,14 +131,19 @@ def test_points_of_a_cell_get_the_dense_convolution_of_their_mean():
     with torch.no_grad():
         conv.bias.normal_()
     x = torch.randn(40, 3, dtype=torch.float64)
-    cells = ((structure.cube.positions(means)[structure.order] + 0.5) * 4).floor().clamp(max=3).long()
-    total, count = torch.zeros(3, 4, 4, 4, dtype=torch.float64), torch.zeros(4, 4, 4, dtype=torch.float64)
+    cells = (
+        ((structure.cube.positions(means)[structure.order] + 0.5) * 4).floor().clamp(max=3).long()
+    )
+    total = torch.zeros(3, 4, 4, 4, dtype=torch.float64)
+    count = torch.zeros(4, 4, 4, dtype=torch.float64)
     for row, (i, j, k) in zip(x, cells.tolist(), strict=True):
         total[:, i, j, k] += row
         count[i, j, k] += 1
     kernel = conv.weight.reshape(3, 3, 3, 3, 5).permute(4, 3, 0, 1, 2)
     dense = F.conv3d((total / count.clamp(min=1))[None], kernel, conv.bias, padding=1)[0]
-    assert torch.allclose(conv(x, level), dense[:, cells[:, 0], cells[:, 1], cells[:, 2]].T, atol=1e-12)
+    assert torch.allclose(
+        conv(x, level), dense[:, cells[:, 0], cells[:, 1], cells[:, 2]].T, atol=1e-12
+    )
 
 
 def test_drop_path_acts_in_training_only_and_keeps_the_mean():
@@ -123,7 +157,8 @@ def test_drop_path_acts_in_training_only_and_keeps_the_mean():
 
 
 def test_batch_norm_equals_torch_in_training_and_takes_a_single_point():
-    ours, theirs = BatchNorm(4), torch.nn.BatchNorm1d(4, eps=1e-3)
+    ours = BatchNorm(4)
+    theirs = torch.nn.BatchNorm1d(4, eps=1e-3)
     x = torch.randn(30, 4, generator=seeded()) * 3 + 2
     assert torch.equal(ours(x), theirs(x))
     one = ours.train()(x[:1])
@@ -146,7 +181,9 @@ def test_scene_norm_at_extremes_follows_float64(offset, spread):
 
 
 def test_submanifold_convolution_passes_gradcheck():
-    cells = torch.tensor(list(itertools.product(range(3), repeat=3)))[torch.randperm(27, generator=seeded())[:9]]
+    cells = torch.tensor(list(itertools.product(range(3), repeat=3)))[
+        torch.randperm(27, generator=seeded())[:9]
+    ]
     x = torch.randn(9, 2, dtype=torch.float64, generator=seeded(1), requires_grad=True)
     weight = torch.randn(27, 2, 3, dtype=torch.float64, generator=seeded(2), requires_grad=True)
     pairs = neighbour_pairs(cells)
@@ -160,7 +197,9 @@ def test_permute_passes_gradcheck_and_indexes():
     assert torch.autograd.gradcheck(lambda a: permute(a, order, order.argsort()), (x,))
 
 
-@pytest.mark.parametrize(("segment", "reduce"), [(segment_max, torch.amax), (segment_mean, torch.mean)])
+@pytest.mark.parametrize(
+    ("segment", "reduce"), [(segment_max, torch.amax), (segment_mean, torch.mean)]
+)
 def test_segments_are_reduced_as_by_a_loop_and_pass_gradcheck(segment, reduce):
     cluster = torch.tensor([0, 2, 1, 2, 0, 2])
     x = torch.randn(6, 3, dtype=torch.float64, generator=seeded(), requires_grad=True)
@@ -174,7 +213,8 @@ def test_the_refiner_gives_the_same_in_pieces_of_any_size(size, monkeypatch):
     scene = normal_scene(700, dtype=torch.float64)
     torch.manual_seed(0)
     refiner = move_zero_layers(Refiner(preset(size, patch=100)).double())
-    scenes, grads = [], []
+    scenes = []
+    grads = []
     for cells in (2**30, 2**13):
         monkeypatch.setattr(sparse_ops, "MAX_ELEMENTS", cells)
         refiner.zero_grad()

@@ -8,7 +8,9 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 
 
-def scene_to_refine(n: int = 200, sh_degree: int = 3, dtype: torch.dtype = torch.float32) -> Gaussians:
+def scene_to_refine(
+    n: int = 200, sh_degree: int = 3, dtype: torch.dtype = torch.float32
+) -> Gaussians:
     """Small blobs, uniform in a cube of side 4."""
     scene = cloud(n, sh_degree=sh_degree).to(dtype)
     return scene.replace(means=4 * scene.means)
@@ -38,8 +40,12 @@ def test_the_sign_of_a_quaternion_changes_no_rotation_and_nothing_else(encoder):
         start = start.map(lambda value: value.clone().requires_grad_())
         refined = refiner(start)
         refiner.zero_grad()
-        turned = refined.quats[:, :, None] * refined.quats[:, None]  # all that a rotation depends on
-        (turned.sum() + sum(value.sum() for name, value in refined.items() if name != "quats")).backward()
+        turned = (
+            refined.quats[:, :, None] * refined.quats[:, None]
+        )  # all that a rotation depends on
+        (
+            turned.sum() + sum(value.sum() for name, value in refined.items() if name != "quats")
+        ).backward()
         found.append((refined, turned, start, [p.grad.clone() for p in refiner.parameters()]))
     (a, turned, start, gradients), (b, b_turned, b_start, b_gradients) = found
     assert torch.equal(b.quats, a.quats * signs) and torch.equal(turned, b_turned)
@@ -60,7 +66,10 @@ def test_residuals_do_not_depend_on_unit_and_place(encoder):
     )
     refiner = small_refiner(encoder=encoder)
     a, b = (
-        [after - before for after, before in zip(refiner(start).tensors(), start.tensors(), strict=True)]
+        [
+            after - before
+            for after, before in zip(refiner(start).tensors(), start.tensors(), strict=True)
+        ]
         for start in (scene, moved)
     )
     assert a[0].abs().max() > 1e-3
@@ -86,7 +95,8 @@ def test_a_scene_of_lower_degree_is_refined_as_if_padded_with_zeros(sh_degree):
     padding = torch.zeros(len(scene), 15 - scene.features_rest.shape[1], 3)
     padded = scene.replace(features_rest=torch.cat([scene.features_rest, padding], dim=1))
     refiner = small_refiner()
-    a, b = refiner(scene), refiner(padded)
+    a = refiner(scene)
+    b = refiner(padded)
     assert a.sh_degree == sh_degree
     assert same(a, b.replace(features_rest=b.features_rest[:, : a.features_rest.shape[1]]))
 
@@ -107,7 +117,10 @@ def test_gradients_reach_every_parameter_once_the_zero_layers_have_moved(changes
     scene = scene_to_refine(400)
     refiner = small_refiner(**changes).train()
     refined = refiner(scene)
-    weights = [torch.randn(v.shape, generator=torch.Generator().manual_seed(i)) for i, v in enumerate(scene.tensors())]
+    weights = [
+        torch.randn(v.shape, generator=torch.Generator().manual_seed(i))
+        for i, v in enumerate(scene.tensors())
+    ]
     sum((v * w).sum() for v, w in zip(refined.tensors(), weights, strict=True)).backward()
     for name, parameter in refiner.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
@@ -120,7 +133,9 @@ def test_a_float64_network_equals_the_float32_one_within_rounding():
     double = refiner.double()(scene)
     for (key, a), b in zip(single.items(), double.tensors(), strict=True):
         assert a.dtype == torch.float64
-        assert torch.allclose(a, b, atol=1e-4), key  # a dozen layers of sums of up to 500 terms in float32
+        assert torch.allclose(a, b, atol=1e-4), (
+            key
+        )  # a dozen layers of sums of up to 500 terms in float32
 
 
 def test_a_scene_of_a_higher_degree_than_the_network_is_refused():
@@ -144,7 +159,9 @@ def hard_scenes() -> dict[str, Gaussians]:
         "coincident": base.replace(means=torch.full((60, 3), 1.5)),
         "within 1e-30": base.replace(means=base.means * 1e-30),
         # too few to tell an outlier from a scene: the others share a cell
-        "one voxel and one far": base[:6].replace(means=torch.cat([base.means[:5] * 1e-6, torch.ones(1, 3)])),
+        "one voxel and one far": base[:6].replace(
+            means=torch.cat([base.means[:5] * 1e-6, torch.ones(1, 3)])
+        ),
         "line": base.replace(means=line),
         "duplicates": Gaussians.cat([base[:20]] * 3),
         "outlier": base.replace(means=outlier),
@@ -199,7 +216,9 @@ def test_unusable_gaussians_come_back_unchanged_and_change_no_others(name, bad):
     refined = refiner(scene)
     good = scene.usable()
     # -Inf is a legal log-scale: such a Gaussian is flat, and refined
-    assert torch.equal((~good).nonzero()[:, 0], bad_rows[:0] if name == "scales" and bad < 0 else bad_rows)
+    assert torch.equal(
+        (~good).nonzero()[:, 0], bad_rows[:0] if name == "scales" and bad < 0 else bad_rows
+    )
     for before, after in zip(scene[~good].tensors(), refined[~good].tensors(), strict=True):
         assert torch.equal(before.nan_to_num(7.0), after.nan_to_num(7.0))
     assert same(refined[good], refiner(scene[good]))

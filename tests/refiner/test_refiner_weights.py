@@ -48,13 +48,17 @@ def test_a_refiner_survives_a_round_trip_to_the_bit(tmp_path, changes):
 def test_a_full_disk_is_one_error_and_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
     def full(state, part, **_):
         Path(part).write_bytes(b"half")
-        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+        raise SafetensorError(
+            "Error while serializing: I/O error: No space left on device (os error 28)"
+        )
 
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
     before = path.read_bytes()
     monkeypatch.setattr("safetensors.torch.save_file", full)
-    with pytest.raises(PointSplatError, match="refiner.safetensors: cannot be written .*No space left on device"):
+    with pytest.raises(
+        PointSplatError, match="refiner.safetensors: cannot be written .*No space left on device"
+    ):
         save_refiner(trained(), path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
@@ -85,7 +89,11 @@ def rewrite(path, config=None, **tensors):
     with safe_open(path, framework="pt") as file:
         header = file.metadata()
     state = {k: v for k, v in {**load_file(path), **tensors}.items() if v is not None}
-    save_file(state, path, metadata={**header, **({"config": json.dumps(config)} if config is not None else {})})
+    save_file(
+        state,
+        path,
+        metadata={**header, **({"config": json.dumps(config)} if config is not None else {})},
+    )
 
 
 def test_files_whose_contents_do_not_fit_are_refused(tmp_path):
@@ -116,12 +124,29 @@ HUGE = [
     {"patch": 1 << 40},
 ]
 
-WRONG = [0, -1, 1.5, math.nan, math.inf, True, None, "1", [], [1], [[1]], {}, {"a": 1}, [None], "x" * 10_000]
+WRONG = [
+    0,
+    -1,
+    1.5,
+    math.nan,
+    math.inf,
+    True,
+    None,
+    "1",
+    [],
+    [1],
+    [[1]],
+    {},
+    {"a": 1},
+    [None],
+    "x" * 10_000,
+]
 
 
 @pytest.fixture()
 def little_memory():
-    """Room for 2 GB more than this process has now: more than that is refused, as on a machine that has no more."""
+    """Room for 2 GB more than this process has now: more than that is refused, as on a machine that
+    has no more."""
     resource = pytest.importorskip("resource")
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     before = resource.getrlimit(resource.RLIMIT_AS)
@@ -166,8 +191,14 @@ def test_settings_of_a_wrong_type_are_one_error(name, tmp_path):
 def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
-    header = {"format": REFINER_FORMAT, "config": json.dumps(vars(trained().config)), "metadata": "{}"}
-    save_file(load_file(path), path, metadata={**header, key: text.encode("utf-8", "replace").decode()})
+    header = {
+        "format": REFINER_FORMAT,
+        "config": json.dumps(vars(trained().config)),
+        "metadata": "{}",
+    }
+    save_file(
+        load_file(path), path, metadata={**header, key: text.encode("utf-8", "replace").decode()}
+    )
     with pytest.raises(WeightsError, match=f"refiner.safetensors: {key} is "):
         (read_refiner if key == "config" else read_metadata)(path)
 
@@ -190,5 +221,7 @@ def test_contradictory_settings_are_refused_by_name(changes, message):
 
 
 def test_an_unknown_size_is_refused():
-    with pytest.raises(PointSplatError, match="no refiner size 'huge'; expected one of full, small, tiny"):
+    with pytest.raises(
+        PointSplatError, match="no refiner size 'huge'; expected one of full, small, tiny"
+    ):
         preset("huge")

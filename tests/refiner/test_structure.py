@@ -46,7 +46,9 @@ def test_degenerate_extents_give_finite_positions_within_the_cube(means):
 
 
 def interleaved(axes: list[int], bits: int) -> int:
-    return sum((axis >> b & 1) << (3 * b + 2 - i) for i, axis in enumerate(axes) for b in range(bits))
+    return sum(
+        (axis >> b & 1) << (3 * b + 2 - i) for i, axis in enumerate(axes) for b in range(bits)
+    )
 
 
 def skilling(point: list[int], bits: int) -> int:
@@ -121,8 +123,12 @@ def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
 @pytest.mark.parametrize("spread", [1, 100, 2**16 - 1])
 def test_neighbour_pairs_are_those_of_brute_force_in_order(spread):
     g = torch.Generator().manual_seed(4)
-    cells = torch.cat([torch.randint(0, 8, (120, 3), generator=g), torch.tensor([[0, 0, 0], [spread] * 3])])
-    cells = torch.unique(torch.cat([cells, spread - cells.clamp(max=spread)]), dim=0).clamp(0, spread)
+    cells = torch.cat(
+        [torch.randint(0, 8, (120, 3), generator=g), torch.tensor([[0, 0, 0], [spread] * 3])]
+    )
+    cells = torch.unique(torch.cat([cells, spread - cells.clamp(max=spread)]), dim=0).clamp(
+        0, spread
+    )
     cells = torch.unique(cells, dim=0)
     cells = cells[torch.randperm(len(cells), generator=g)]
     expected = []

@@ -1,9 +1,10 @@
-"""Runs ``pointsplat`` commands one after another in this process, cut off from the network, and writes what each did.
+"""Runs ``pointsplat`` commands one after another in this process, cut off from the network, and
+writes what each did.
 
     python bare_machine.py < COMMANDS.json
 
-A command is a list of words; of each are said what it printed, its exit status and the hosts that it tried to reach.
-Views are as small as in the other tests.
+A command is a list of words; of each are said what it printed, its exit status and the hosts that
+it tried to reach. Views are as small as in the other tests.
 """
 
 import io
@@ -19,7 +20,8 @@ tried: list[str] = []
 
 
 def no_network(event: str, arguments: tuple) -> None:
-    """Fail whatever asks for a host's address or connects to one, as on a machine without network."""
+    """Fail whatever asks for a host's address or connects to one, as on a machine without
+    network."""
     if event in ("socket.connect", "socket.getaddrinfo", "socket.gethostbyname", "socket.sendto"):
         tried.append(f"{event} {arguments}")
         raise OSError(101, "Network is unreachable")

@@ -14,17 +14,28 @@ SECONDS = 90
 
 @contextmanager
 def chromium() -> Iterator:
-    """A browser of its own, closed at the end. The test is skipped where Chromium or its driver is missing."""
+    """A browser of its own, closed at the end. The test is skipped where Chromium or its driver is
+    missing."""
     selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    programs = filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")))
-    options, driver = selenium.ChromeOptions(), shutil.which("chromedriver")
+    programs = filter(
+        None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))
+    )
+    options = selenium.ChromeOptions()
+    driver = shutil.which("chromedriver")
     options.binary_location = next(programs, "")
     if not options.binary_location or driver is None:
         pytest.skip("no Chromium with chromedriver on the path, so no page can be opened")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    arguments = ["--headless=new", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1200,900"]
+    arguments = [
+        "--headless=new",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--window-size=1200,900",
+    ]
     arguments += ["--enable-unsafe-swiftshader"]  # WebGL without a GPU
-    arguments += ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []  # Chromium has none for root
+    arguments += (
+        ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
+    )  # Chromium has none for root
     for argument in arguments:
         options.add_argument(argument)
     browser = selenium.Chrome(options=options, service=selenium.ChromeService(driver))
@@ -45,14 +56,17 @@ def before_pages_load(browser, script: str) -> Iterator[None]:
 
 
 def complaints(browser) -> list[str]:
-    """What the browser has logged since the last call: errors of scripts, and what the policy of a page forbade. What a
-    graphics driver says of its speed is left out."""
+    """What the browser has logged since the last call: errors of scripts, and what the policy of a
+    page forbade. What a graphics driver says of its speed is left out."""
     messages = (entry["message"] for entry in browser.get_log("browser"))
-    return [message for message in messages if "GL Driver Message (OpenGL, Performance" not in message]
+    return [
+        message for message in messages if "GL Driver Message (OpenGL, Performance" not in message
+    ]
 
 
 def phone_and_colours(browser) -> tuple[int, list[str]]:
-    """How wide the open page is on a phone 360 pixels wide, and its background for readers of light and of dark."""
+    """How wide the open page is on a phone 360 pixels wide, and its background for readers of light
+    and of dark."""
     size = {"width": 360, "height": 740, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
@@ -61,7 +75,9 @@ def phone_and_colours(browser) -> tuple[int, list[str]]:
         for scheme in ("light", "dark"):
             feature = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
             browser.execute_cdp_cmd("Emulation.setEmulatedMedia", feature)
-            colors.append(browser.execute_script("return getComputedStyle(document.body).backgroundColor"))
+            colors.append(
+                browser.execute_script("return getComputedStyle(document.body).backgroundColor")
+            )
         return width, colors
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

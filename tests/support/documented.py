@@ -1,4 +1,5 @@
-"""The documentation and the examples of ``--help``: their code, and the parsers of the programs that it names."""
+"""The documentation and the examples of ``--help``: their code, and the parsers of the programs
+that it names."""
 
 import functools
 import importlib.metadata
@@ -65,7 +66,8 @@ def blocks_of(page: Path) -> Iterator[Block]:
 
 
 def commands_of(block: Block) -> Iterator[Command]:
-    """The command lines of a block, without comments and without settings of the environment before them."""
+    """The command lines of a block, without comments and without settings of the environment before
+    them."""
     for line in block.text.replace("\\\n", " ").splitlines():
         words = shlex.split(re.sub(r"^([A-Z_]+=\S* )+", "", line), comments=True)
         if words:
@@ -75,7 +77,9 @@ def commands_of(block: Block) -> Iterator[Command]:
 def inline_code() -> Iterator[tuple[Path, str]]:
     """The code within lines of text."""
     for page in PAGES:
-        text = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+        text = re.sub(
+            r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE
+        )
         for code in re.findall(r"`([^`\n]+)`", text):
             yield page, code
 
@@ -83,8 +87,16 @@ def inline_code() -> Iterator[tuple[Path, str]]:
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 EVERY = [
     *(command for block in BLOCKS if block.language == "bash" for command in commands_of(block)),
-    *(Command(page.name, (*shlex.split(code),)) for page, code in inline_code() if page == PAGES[0] and " " in code),
-    *(Command(f"pointsplat {name} --help", (*shlex.split(text),)) for name in EXAMPLES for _, text in EXAMPLES[name]),
+    *(
+        Command(page.name, (*shlex.split(code),))
+        for page, code in inline_code()
+        if page == PAGES[0] and " " in code
+    ),
+    *(
+        Command(f"pointsplat {name} --help", (*shlex.split(text),))
+        for name in EXAMPLES
+        for _, text in EXAMPLES[name]
+    ),
 ]
 COMMANDS = [*{command.words: command for command in reversed(EVERY)}.values()]
 """Each command line once, where it is shown first."""
@@ -107,7 +119,8 @@ def without_body(function: Callable) -> Callable:
 @contextmanager
 def parsers_only(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """While this is open, programs read their arguments and do no more."""
-    parse, parse_commands = tyro.cli, tyro.extras.subcommand_cli_from_dict
+    parse = tyro.cli
+    parse_commands = tyro.extras.subcommand_cli_from_dict
 
     def cli(target, *args, **options):
         parse(without_body(target) if inspect.isfunction(target) else target, *args, **options)
@@ -146,7 +159,9 @@ def check_arguments(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> 
         start(words, monkeypatch)
 
 
-def help_of(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> str:
+def help_of(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> str:
     """What a program says of its options."""
     with parsers_only(monkeypatch), pytest.raises(SystemExit):
         start((*words, "--help"), monkeypatch)

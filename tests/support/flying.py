@@ -25,7 +25,9 @@ def settle(browser) -> None:
 
 def message(browser) -> str:
     """What is written in place of a picture; empty if nothing is."""
-    return browser.execute_script("return flight.part.message.hidden ? '' : flight.part.message.textContent")
+    return browser.execute_script(
+        "return flight.part.message.hidden ? '' : flight.part.message.textContent"
+    )
 
 
 def shrink(browser, width: int = 192) -> None:
@@ -49,7 +51,15 @@ def view_on(stage: FlightFrame, index: int, image: Tensor) -> ps.View:
     view = stage.views[index]
     focal = float(view.K[0, 0]) * min(width / view.width, height / view.height)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return ps.View(view.viewmat.float(), K, width, height, view.background, view.rasterize_mode, view.near_plane)
+    return ps.View(
+        view.viewmat.float(),
+        K,
+        width,
+        height,
+        view.background,
+        view.rasterize_mode,
+        view.near_plane,
+    )
 
 
 def camera(browser) -> dict[str, list[float]]:

@@ -35,7 +35,9 @@ def parts_of(path: Path) -> Parts:
 
 def policy_of(parts: Parts) -> dict[str, str]:
     """The content security policy of a page, by rule."""
-    [policy] = [a["content"] for _, a in parts.elements if a.get("http-equiv") == "Content-Security-Policy"]
+    [policy] = [
+        a["content"] for _, a in parts.elements if a.get("http-equiv") == "Content-Security-Policy"
+    ]
     return dict(rule.split(" ", 1) for rule in str(policy).split("; "))
 
 
@@ -48,7 +50,24 @@ def names_nothing_outside(path: Path) -> None:
     """Fail if a page names a URL, or has an element or attribute that could load something."""
     parts = parts_of(path)
     names = {name for _, attributes in parts.elements for name in attributes}
-    assert not names & {"src", "href", "srcset", "xlink:href", "action", "data", "style", "background", "poster"}
-    assert not {tag for tag, _ in parts.elements} & {"link", "iframe", "object", "embed", "base", "form"}
+    assert not names & {
+        "src",
+        "href",
+        "srcset",
+        "xlink:href",
+        "action",
+        "data",
+        "style",
+        "background",
+        "poster",
+    }
+    assert not {tag for tag, _ in parts.elements} & {
+        "link",
+        "iframe",
+        "object",
+        "embed",
+        "base",
+        "form",
+    }
     text = re.sub(r"base64,[\w+/=]*", "", path.read_text("utf-8"))
     assert not re.search(r"://|url\(|@import", text)

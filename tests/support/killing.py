@@ -19,11 +19,13 @@ def killed_after_steps(count):
                 os.kill(os.getpid(), signal.SIGKILL)
     sys.addaudithook(heard)
 """
-"""The start of a program: a function that kills it once it has kept so many steps of merging by cells; 0 never does."""
+"""The start of a program: a function that kills it once it has kept so many steps of merging by
+cells; 0 never does."""
 
 
 def where(seconds: float) -> tuple[int, int]:
-    """The process, and its number of threads, after some seconds; killed after as many below zero."""
+    """The process, and its number of threads, after some seconds; killed after as many below
+    zero."""
     time.sleep(abs(seconds))
     if seconds < 0:
         os.kill(os.getpid(), signal.SIGKILL)

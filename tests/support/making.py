@@ -1,5 +1,5 @@
-"""What several test modules make: scenes, cameras, settings of a training, runs whose data is gone; and what a file
-imports."""
+"""What several test modules make: scenes, cameras, settings of a training, runs whose data is gone;
+and what a file imports."""
 
 import ast
 import itertools
@@ -58,11 +58,14 @@ def equal(a: object, b: object) -> bool:
     """Whether nested dictionaries of tensors and other values are equal to the bit."""
     if isinstance(a, dict) and isinstance(b, dict):
         return a.keys() == b.keys() and all(equal(a[name], b[name]) for name in a)
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else a == b
+    return (
+        torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else a == b
+    )
 
 
 def assert_same_on_any_threads(function: Callable[[], Sequence[torch.Tensor]]) -> None:
-    """Fail unless the tensors that a function gives have the same bits on one thread, two and five."""
+    """Fail unless the tensors that a function gives have the same bits on one thread, two and
+    five."""
     with fixed_threads(1):
         wanted = function()
     for threads in (2, 5):
@@ -70,21 +73,28 @@ def assert_same_on_any_threads(function: Callable[[], Sequence[torch.Tensor]]) -
             assert all(torch.equal(a, b) for a, b in zip(wanted, function(), strict=True))
 
 
-def normal_scene(n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
+def normal_scene(
+    n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32
+) -> Gaussians:
     """A scene whose every parameter is drawn from the standard normal distribution."""
     generator = torch.Generator().manual_seed(seed)
     shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
     return Gaussians(*(torch.randn(shape, generator=generator, dtype=dtype) for shape in shapes))
 
 
-def splats(means: torch.Tensor, scales, logits, colours=0.0, quats=(1.0, 0.0, 0.0, 0.0), degree: int = 0) -> Gaussians:
-    """Gaussians at ``means`` (N, 3), without SH. What else they have is a number or a row for all, or one for each."""
+def splats(
+    means: torch.Tensor, scales, logits, colours=0.0, quats=(1.0, 0.0, 0.0, 0.0), degree: int = 0
+) -> Gaussians:
+    """Gaussians at ``means`` (N, 3), without SH. What else they have is a number or a row for all,
+    or one for each."""
     n = len(means)
     scales, logits, colours, quats = (
         torch.as_tensor(value).to(means.dtype).expand(n, width).clone()
         for value, width in ((scales, 3), (logits, 1), (colours, 3), (quats, 4))
     )
-    return Gaussians(means, scales, quats, logits, colours, means.new_zeros(n, (degree + 1) ** 2 - 1, 3))
+    return Gaussians(
+        means, scales, quats, logits, colours, means.new_zeros(n, (degree + 1) ** 2 - 1, 3)
+    )
 
 
 def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
@@ -97,7 +107,12 @@ def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
 
 
 def ball(
-    n: int, degree: int = 1, seed: int = 0, log_size: float = math.log(0.25), opacity: float = 2.0, bright: float = 0.0
+    n: int,
+    degree: int = 1,
+    seed: int = 0,
+    log_size: float = math.log(0.25),
+    opacity: float = 2.0,
+    bright: float = 0.0,
 ) -> Gaussians:
     """The inside of a ball of radius 2, covered with coloured blobs."""
     g = torch.Generator().manual_seed(seed)
@@ -105,7 +120,9 @@ def ball(
     means, scales, quats, opacities, rest = (torch.randn(shape, generator=g) for shape in shapes)
     means = 2 * means / means.norm(dim=1, keepdim=True)
     colours = bright + torch.sin(2 * means)
-    return Gaussians(means, log_size + 0.2 * scales, quats, opacity + opacities, colours, 0.05 * rest)
+    return Gaussians(
+        means, log_size + 0.2 * scales, quats, opacity + opacities, colours, 0.05 * rest
+    )
 
 
 class Bomb:  # prints when it is unpickled as usual
@@ -118,7 +135,8 @@ EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])
 
 
 def photographed(n: int = 600, degree: int = 3, eyes: torch.Tensor = EYES) -> Gaussians:
-    """A ball whose SH were moved along the basis in the directions that eyes see it from, by random steps."""
+    """A ball whose SH were moved along the basis in the directions that eyes see it from, by random
+    steps."""
     from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
     scene = ball(n, degree)
@@ -135,40 +153,61 @@ def box_room(seed: int, count: int = 900, size: float = 0.15, smooth: bool = Fal
     """A closed box of opaque Gaussians, 4 x 3 x 2 scene units: free inside, covered all around."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.rand(count, 3, generator=generator) * 2 - 1
-    rows, axis = torch.arange(count), torch.arange(count) % 3
+    rows = torch.arange(count)
+    axis = torch.arange(count) % 3
     means[rows, axis] = torch.sign(means[rows, axis])
     phase = torch.randn(3 if smooth else (count, 3), generator=generator)
     colours = torch.sin(2 * means + phase) if smooth else phase
-    return splats(means * torch.tensor([2.0, 1.5, 1.0]), torch.tensor(size).log(), 4.0, colours, degree=1)
+    return splats(
+        means * torch.tensor([2.0, 1.5, 1.0]), torch.tensor(size).log(), 4.0, colours, degree=1
+    )
 
 
 def splats_in_view(
-    n: int, seed: int = 0, dtype=torch.float64, scale: float = -3.0, spread: float = 0.8, opacity: float = 1.0
+    n: int,
+    seed: int = 0,
+    dtype=torch.float64,
+    scale: float = -3.0,
+    spread: float = 0.8,
+    opacity: float = 1.0,
 ) -> list[torch.Tensor]:
-    """What a rasterizer takes, before the camera of :func:`camera_askew`: means (N, 3), quats (N, 4), scales (N, 3),
-    opacities (N,) and SH of degree 3 (N, 16, 3)."""
+    """What a rasterizer takes, before the camera of :func:`camera_askew`: means (N, 3), quats (N,
+    4), scales (N, 3), opacities (N,) and SH of degree 3 (N, 16, 3)."""
     random = {"generator": torch.Generator().manual_seed(seed), "dtype": torch.float64}
-    means = torch.randn(n, 3, **random) * torch.tensor([1.0, 1.0, 0.5]) + torch.tensor([0.0, 0.0, 3.0])
+    means = torch.randn(n, 3, **random) * torch.tensor([1.0, 1.0, 0.5]) + torch.tensor(
+        [0.0, 0.0, 3.0]
+    )
     scales = torch.exp(torch.randn(n, 3, **random) * spread + scale)
     opacities = torch.rand(n, **random) * opacity
-    quats, sh = torch.randn(n, 4, **random), 0.3 * torch.randn(n, 16, 3, **random)
+    quats = torch.randn(n, 4, **random)
+    sh = 0.3 * torch.randn(n, 16, 3, **random)
     return [value.to(dtype) for value in (means, quats, scales, opacities, sh)]
 
 
-def camera_askew(dtype=torch.float64, angle: float = 0.2, cx: float = 20.0, cy: float = 13.0, focal: float = 40.0):
-    """World-to-camera matrix (4, 4), turned by ``angle`` radians and moved a little, and intrinsics (3, 3) in pixels
-    whose principal point is not the middle of any usual image."""
-    c, s = math.cos(angle), math.sin(angle)
+def camera_askew(
+    dtype=torch.float64, angle: float = 0.2, cx: float = 20.0, cy: float = 13.0, focal: float = 40.0
+):
+    """World-to-camera matrix (4, 4), turned by ``angle`` radians and moved a little, and intrinsics
+    (3, 3) in pixels whose principal point is not the middle of any usual image."""
+    c = math.cos(angle)
+    s = math.sin(angle)
     view = [[c, 0, s, 0.1], [0, 1, 0, -0.1], [-s, 0, c, 0.2], [0, 0, 0, 1]]
     K = [[focal, 0, cx], [0, 1.05 * focal, cy], [0, 0, 1]]
     return torch.tensor(view, dtype=dtype), torch.tensor(K, dtype=dtype)
 
 
 def small_refiner(trained: bool = True, seed: int = 0, **changes):
-    """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that residuals are not zero."""
+    """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that
+    residuals are not zero."""
     from pointsplat_ns.refiner import Refiner, preset
 
-    sizes = {"strides": (2,), "enc_channels": (16, 16), "enc_depths": (1, 1), "enc_heads": (2, 2), "patch": 32}
+    sizes = {
+        "strides": (2,),
+        "enc_channels": (16, 16),
+        "enc_depths": (1, 1),
+        "enc_heads": (2, 2),
+        "patch": 32,
+    }
     sizes |= {"dec_channels": (16,), "dec_depths": (1,), "dec_heads": (2,), "head_width": 16}
     torch.manual_seed(seed)
     refiner = Refiner(preset("tiny", **sizes | changes)).eval()
@@ -185,14 +224,23 @@ def move_zero_layers(refiner):
 
 
 def small_config(data: Path, output_dir: Path, steps: int, **model):
-    """The method as registered, at a size for tests; no LPIPS in the loss, so that nothing is downloaded."""
+    """The method as registered, at a size for tests; no LPIPS in the loss, so that nothing is
+    downloaded."""
     from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
 
     config = pointsplat_config()
     config.machine.device_type = "cpu"
-    config.output_dir, config.max_num_iterations, config.experiment_name = output_dir, steps, "refiner"
+    config.output_dir = output_dir
+    config.max_num_iterations = steps
+    config.experiment_name = "refiner"
     config.pipeline.datamanager.data = config.data = data
-    for name, value in {"size": "tiny", "keep": 0.5, "by": "paper", "lpips_weight": 0.0, **model}.items():
+    for name, value in {
+        "size": "tiny",
+        "keep": 0.5,
+        "by": "paper",
+        "lpips_weight": 0.0,
+        **model,
+    }.items():
         setattr(config.pipeline.model, name, value)
     config.set_timestamp()
     return config
@@ -207,16 +255,19 @@ def fast_config(data: Path, output_dir: Path, steps: int = 10, **model):
 
 
 def dense_config(data: Path, output_dir: Path, steps: int):
-    """The method at a size for tests, which renders a few tiny pictures of scenes without photos."""
+    """The method at a size for tests, which renders a few tiny pictures of scenes without
+    photos."""
     config = small_config(data, output_dir, steps, keep=0.4)
     config.steps_per_eval_image = 3
-    config.pipeline.datamanager.sampled_poses, config.pipeline.datamanager.sampled_size = 6, (48, 36)
+    config.pipeline.datamanager.sampled_poses = 6
+    config.pipeline.datamanager.sampled_size = (48, 36)
     return config
 
 
 def losses_of(trainer) -> list[float]:
     """A list that gets the loss of every step that a trainer of nerfstudio takes from now on."""
-    losses, iteration = [], trainer.train_iteration
+    losses = []
+    iteration = trainer.train_iteration
 
     def recorded(step: int):
         result = iteration(step)
@@ -229,7 +280,8 @@ def losses_of(trainer) -> list[float]:
 
 @contextmanager
 def views_sampled_once() -> Iterator[None]:
-    """Within, trainings do not sample a scene's poses again that they sampled before. That takes most of their time."""
+    """Within, trainings do not sample a scene's poses again that they sampled before. That takes
+    most of their time."""
     from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 
     known = {}
@@ -258,12 +310,14 @@ def run_of(folder: Path, name: str) -> Path:
 
 
 def write_run(folder: Path, steps: int, planned: int) -> Path:
-    """The folder of a run that took some of the steps that it was to take, with a checkpoint, which it gives."""
+    """The folder of a run that took some of the steps that it was to take, with a checkpoint, which
+    it gives."""
     checkpoint = folder / "nerfstudio_models" / f"step-{steps - 1:09d}.ckpt"
     checkpoint.parent.mkdir(parents=True)
     torch.save({}, checkpoint)
     (folder / "config.yml").write_text(
-        f"!!python/object:a.Trainer\nmax_num_iterations: {planned}\npipeline: !!python/object:a.Pipeline\n"
+        f"!!python/object:a.Trainer\nmax_num_iterations: {planned}\npipeline: "
+        "!!python/object:a.Pipeline\n"
         "  datamanager: !!python/object:a.Data {}\n  model: !!python/object:a.Model {}\n"
     )
     return checkpoint
@@ -277,11 +331,15 @@ def without_data(runs: Path, folder: Path) -> Path:
     return folder
 
 
-def noisy_pair(*shape: int, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
+def noisy_pair(
+    *shape: int, dtype: torch.dtype = torch.float32
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Images (..., H, W, 3) in [0, 1]: one with noise, and the same without."""
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(*shape, 3, generator=generator, dtype=dtype)
-    return (target + 0.1 * torch.randn(*shape, 3, generator=generator, dtype=dtype)).clamp(0, 1), target
+    return (target + 0.1 * torch.randn(*shape, 3, generator=generator, dtype=dtype)).clamp(
+        0, 1
+    ), target
 
 
 def decoded(path: Path) -> list[np.ndarray]:
@@ -289,7 +347,10 @@ def decoded(path: Path) -> list[np.ndarray]:
     import av
     from av.video.reformatter import ColorRange
 
-    ranges = {"src_color_range": ColorRange.MPEG, "dst_color_range": ColorRange.JPEG}  # PyAV 16 does not ask
+    ranges = {
+        "src_color_range": ColorRange.MPEG,
+        "dst_color_range": ColorRange.JPEG,
+    }  # PyAV 16 does not ask
     with av.open(str(path)) as container:
         frames = [frame.reformat(format="rgb24", **ranges) for frame in container.decode(video=0)]
     return [frame.to_ndarray() for frame in frames]
@@ -308,15 +369,21 @@ class FewViews(ViewSource):
 def in_pictures(views: Views, points: torch.Tensor, min_depth: float = 0.0) -> torch.Tensor:
     """Which points (N, 3) beyond a depth are in the pictures of C views, (C, N) bool."""
     at = views.viewmats[:, :3, :3].to(points) @ points.T + views.viewmats[:, :3, 3:].to(points)
-    x, y, depth = (views.Ks.to(points) @ at).unbind(1)  # x and y in pixels, times the depth: nothing is divided by it
+    x, y, depth = (views.Ks.to(points) @ at).unbind(
+        1
+    )  # x and y in pixels, times the depth: nothing is divided by it
     within = (x > 0) & (x < views.width * depth) & (y > 0) & (y < views.height * depth)
     return (depth > min_depth) & within
 
 
-def views_from_within(centre: tuple[float, float, float], count: int, width: int, height: int) -> Views:
+def views_from_within(
+    centre: tuple[float, float, float], count: int, width: int, height: int
+) -> Views:
     """Cameras up to half a unit from a place, which look to all sides, about level."""
     generator = torch.Generator().manual_seed(11)
     eyes = torch.tensor(centre) + torch.rand(count, 3, generator=generator) - 0.5
     turns = 2 * math.pi * torch.arange(count) / count
-    ahead = torch.stack([turns.cos(), turns.sin(), 0.4 * torch.rand(count, generator=generator) - 0.3], dim=1)
+    ahead = torch.stack(
+        [turns.cos(), turns.sin(), 0.4 * torch.rand(count, generator=generator) - 0.3], dim=1
+    )
     return views_of(look_at(eyes.double(), (eyes + ahead).double()), width, height, 5.0)

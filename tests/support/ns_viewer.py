@@ -1,4 +1,5 @@
-"""A client of nerfstudio's viewer, as its page is one: it says where its camera stands and gets pictures."""
+"""A client of nerfstudio's viewer, as its page is one: it says where its camera stands and gets
+pictures."""
 
 import io
 import urllib.request
@@ -16,19 +17,22 @@ from websockets.sync.client import connect
 
 SECONDS = 120
 """How long it waits for what shall come; a picture takes a fraction of a second."""
-FIELD_OF_VIEW, ASPECT = 1.2, 4 / 3
+FIELD_OF_VIEW = 1.2
+ASPECT = 4 / 3
 """Vertical, in radians, and width by height."""
 
 
 class Look(NamedTuple):
-    """What a client of the viewer got, and what the model draws from the same camera, (H, W, 3) in [0, 1]."""
+    """What a client of the viewer got, and what the model draws from the same camera, (H, W, 3) in
+    [0, 1]."""
 
     page: bytes
     picture: np.ndarray
     expected: np.ndarray
 
     def check(self) -> None:
-        """Fail unless the page is one, and the picture what the model draws; for a viewer that sends PNG."""
+        """Fail unless the page is one, and the picture what the model draws; for a viewer that
+        sends PNG."""
         assert b"<html" in self.page
         assert self.picture.std() > 0.03, "a plain picture proves nothing"
         # 1/255: rounding to 8 bits, down
@@ -41,8 +45,16 @@ def look(viewer: Viewer, pose: np.ndarray) -> Look:
     with urllib.request.urlopen(f"http://{place}/", timeout=SECONDS) as response:
         page = response.read()
     turn = vtf.SO3.from_matrix(pose[:3, :3]) @ vtf.SO3.from_x_radians(np.pi)
-    camera = {"wxyz": turn.wxyz.tolist(), "position": (pose[:3, 3] * VISER_NERFSTUDIO_SCALE_RATIO).tolist()}
-    camera |= {"fov": FIELD_OF_VIEW, "aspect": ASPECT, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0]}
+    camera = {
+        "wxyz": turn.wxyz.tolist(),
+        "position": (pose[:3, 3] * VISER_NERFSTUDIO_SCALE_RATIO).tolist(),
+    }
+    camera |= {
+        "fov": FIELD_OF_VIEW,
+        "aspect": ASPECT,
+        "look_at": [0.0, 0.0, 0.0],
+        "up_direction": [0.0, 0.0, 1.0],
+    }
     with connect(f"ws://{place}", max_size=None, open_timeout=SECONDS) as socket:
         socket.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **camera}))
         picture = None

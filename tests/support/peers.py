@@ -19,7 +19,8 @@ rows = rows[: count * size] if option == "--decimate" else rows[-count * size :]
 header = re.sub(rb"element vertex \\d+", b"element vertex %d" % count, header)
 open(target, "wb").write(header + found + rows)
 """
-"""Stands for splat-transform, a Node package: takes its options, and keeps the first or the last Gaussians."""
+"""Stands for splat-transform, a Node package: takes its options, and keeps the first or the last
+Gaussians."""
 
 
 def peer(folder: Path, version: str, says: str | None = None, fails: str = "") -> str:

@@ -22,49 +22,78 @@ def inria(views: Views) -> list[dict]:
     poses = invert_rigid(views.viewmats.double())
     return [
         {
-            "id": index, "img_name": name_of(index), "width": views.width, "height": views.height,
-            "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist(),
-            "fy": float(K[1, 1]), "fx": float(K[0, 0]),
+            "id": index,
+            "img_name": name_of(index),
+            "width": views.width,
+            "height": views.height,
+            "position": pose[:3, 3].tolist(),
+            "rotation": pose[:3, :3].tolist(),
+            "fy": float(K[1, 1]),
+            "fx": float(K[0, 0]),
         }
         for index, (pose, K) in enumerate(zip(poses, views.Ks, strict=True))
-    ]  # fmt: skip
+    ]
 
 
 def nerfstudio(views: Views) -> dict:
-    """What nerfstudio's processing of data writes as ``transforms.json``, intrinsics once for all."""
-    poses, K = viewmats_to_opengl(views.viewmats.double()), views.Ks[0]
+    """What nerfstudio's processing of data writes as ``transforms.json``, intrinsics once for
+    all."""
+    poses = viewmats_to_opengl(views.viewmats.double())
+    K = views.Ks[0]
     frames = [
-        {"file_path": f"images/{name_of(index)}", "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
+        {
+            "file_path": f"images/{name_of(index)}",
+            "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
+        }
         for index, pose in enumerate(poses)
     ]
     return {
-        "w": views.width, "h": views.height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]),
-        "cx": float(K[0, 2]), "cy": float(K[1, 2]), "k1": 0.0, "camera_model": "OPENCV", "frames": frames,
-    }  # fmt: skip
+        "w": views.width,
+        "h": views.height,
+        "fl_x": float(K[0, 0]),
+        "fl_y": float(K[1, 1]),
+        "cx": float(K[0, 2]),
+        "cy": float(K[1, 2]),
+        "k1": 0.0,
+        "camera_model": "OPENCV",
+        "frames": frames,
+    }
 
 
 def write_colmap(folder: Path, suffix: str, lens: tuple, poses: dict, seeds=(), colors=()) -> Path:
-    """A model as COLMAP writes it, ``.txt`` or ``.bin``; each image has as many points as its index.
+    """A model as COLMAP writes it, ``.txt`` or ``.bin``; each image has as many points as its
+    index.
 
-    ``lens`` is model, width, height and parameters, ``poses`` are world-to-camera matrices (4, 4) by names of images.
+    ``lens`` is model, width, height and parameters, ``poses`` are world-to-camera matrices (4, 4)
+    by names of images.
     """
     folder.mkdir(parents=True, exist_ok=True)
     images = {}
     for index, (name, viewmat) in enumerate(poses.items()):
         pose = colmap.rotmat2qvec(viewmat[:3, :3]), viewmat[:3, 3]
-        images[10 + index] = colmap.Image(10 + index, *pose, 3, name, np.full((index, 2), 1.5), np.full(index, -1))
+        images[10 + index] = colmap.Image(
+            10 + index, *pose, 3, name, np.full((index, 2), 1.5), np.full(index, -1)
+        )
     seen = np.array([10, 11]), np.array([0, 1])  # images, and places among their points
-    points = {i: colmap.Point3D(i, *each, 0.5, *seen) for i, each in enumerate(zip(seeds, colors, strict=True))}
+    points = {
+        i: colmap.Point3D(i, *each, 0.5, *seen)
+        for i, each in enumerate(zip(seeds, colors, strict=True))
+    }
     colmap.write_model({3: colmap.Camera(3, *lens)}, images, points, str(folder), suffix)
     return folder
 
 
-def write_sparse(views: Views, folder: Path, suffix: str = ".txt", model: str = "PINHOLE", extra=()) -> Path:
-    """A model as COLMAP writes it, of cameras alone; ``extra`` are the parameters of their distortion."""
+def write_sparse(
+    views: Views, folder: Path, suffix: str = ".txt", model: str = "PINHOLE", extra=()
+) -> Path:
+    """A model as COLMAP writes it, of cameras alone; ``extra`` are the parameters of their
+    distortion."""
     K = views.Ks[0].tolist()
     lens = model, views.width, views.height, [K[0][0], K[1][1], K[0][2], K[1][2], *extra]
     viewmats = views.viewmats.double().numpy()
-    return write_colmap(folder, suffix, lens, {name_of(index): viewmat for index, viewmat in enumerate(viewmats)})
+    return write_colmap(
+        folder, suffix, lens, {name_of(index): viewmat for index, viewmat in enumerate(viewmats)}
+    )
 
 
 def write_photos(scene: Gaussians, views: Views, folder: Path) -> Path:

@@ -1,8 +1,9 @@
-"""A GPU that every machine has, for want of a real one: tensors that say they are elsewhere, and are computed on the
-CPU.
+"""A GPU that every machine has, for want of a real one: tensors that say they are elsewhere, and
+are computed on the CPU.
 
-While :func:`pretend_gpu` is open, torch's device "meta" holds numbers. Operations that mix its tensors with those of
-the CPU fail as they do on a GPU. All operations on it are listed with their thread.
+While :func:`pretend_gpu` is open, torch's device "meta" holds numbers. Operations that mix its
+tensors with those of the CPU fail as they do on a GPU. All operations on it are listed with their
+thread.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 GPU = torch.device("meta")
-"""The device. Its name is one that torch knows, needs no library for, and whose backward pass runs where it is
-called."""
+"""The device. Its name is one that torch knows, needs no library for, and whose backward pass runs
+where it is called."""
 
 
 class Recorded:
@@ -34,8 +35,13 @@ class Recorded:
         return {name for name, thread in self.operations if thread != self.here}
 
     def linear_algebra(self) -> set[str]:
-        """Those that need the library of linear algebra that torch loads when one is first called."""
-        return {name for name, _ in self.operations if "linalg" in name and not re.search("cross|norm", name)}
+        """Those that need the library of linear algebra that torch loads when one is first
+        called."""
+        return {
+            name
+            for name, _ in self.operations
+            if "linalg" in name and not re.search("cross|norm", name)
+        }
 
 
 recorded: Recorded | None = None
@@ -49,9 +55,13 @@ class _There(torch.Tensor):
     @staticmethod
     def __new__(cls, numbers: torch.Tensor) -> _There:
         there = torch.Tensor._make_wrapper_subclass(
-            cls, numbers.shape, strides=numbers.stride(), storage_offset=numbers.storage_offset(),
-            dtype=numbers.dtype, device=GPU,
-        )  # fmt: skip
+            cls,
+            numbers.shape,
+            strides=numbers.stride(),
+            storage_offset=numbers.storage_offset(),
+            dtype=numbers.dtype,
+            device=GPU,
+        )
         there.numbers = numbers
         return there
 
@@ -80,21 +90,28 @@ def _computed(function: Any, args: tuple, kwargs: dict) -> Any:
         recorded.operations.append((name, threading.get_ident()))
     if device is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
-    args, kwargs = tree_map(lambda value: value.numbers if isinstance(value, _There) else value, (args, kwargs))
+    args, kwargs = tree_map(
+        lambda value: value.numbers if isinstance(value, _There) else value, (args, kwargs)
+    )
     result = function(*args, **kwargs)
     mutated = [value for value in given if isinstance(value, _There) and value.numbers is result]
     if mutated:
         return mutated[0]
-    return tree_map(lambda value: _There(value) if to and isinstance(value, torch.Tensor) else value, result)
+    return tree_map(
+        lambda value: _There(value) if to and isinstance(value, torch.Tensor) else value, result
+    )
 
 
-class _Here(TorchDispatchMode):  # catches what makes tensors of the device from nothing, or from those of the CPU
+class _Here(
+    TorchDispatchMode
+):  # catches what makes tensors of the device from nothing, or from those of the CPU
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         return _computed(function, args, kwargs or {})
 
 
 def _made_here(function: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
-    """A function that makes a tensor of numbers, which it copies to the device: torch writes none to its own "meta"."""
+    """A function that makes a tensor of numbers, which it copies to the device: torch writes none
+    to its own "meta"."""
 
     def made(*args: Any, device: Any = None, **options: Any) -> torch.Tensor:
         if device is None or torch.device(device) != GPU:
@@ -115,13 +132,18 @@ class _Autocast(torch.autocast):  # torch knows no precision of its own "meta"
 
 @contextmanager
 def pretend_gpu() -> Iterator[Recorded]:
-    """Let tensors be moved to :data:`GPU` while the context is open, and give the record of what is done there."""
+    """Let tensors be moved to :data:`GPU` while the context is open, and give the record of what is
+    done there."""
     global recorded
     recorded = Recorded()
     patched = {name: _made_here(getattr(torch, name)) for name in ("tensor", "as_tensor")}
     patched["autocast"] = _Autocast
     try:
-        with _Here(), mock.patch.multiple(torch, **patched), mock.patch.object(torch.Tensor, "new_tensor", _new_tensor):
+        with (
+            _Here(),
+            mock.patch.multiple(torch, **patched),
+            mock.patch.object(torch.Tensor, "new_tensor", _new_tensor),
+        ):
             yield recorded
     finally:
         recorded = None

@@ -9,7 +9,9 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.errors import PointSplatError
 
 
-def fails(call: Callable[[], object], *fragments: object, error: type[PointSplatError] = PointSplatError) -> str:
+def fails(
+    call: Callable[[], object], *fragments: object, error: type[PointSplatError] = PointSplatError
+) -> str:
     """The one line of the error that a call raises, in which all fragments are."""
     with pytest.raises(error) as caught:
         call()
@@ -25,7 +27,8 @@ def run(*words: object) -> None:
 
 
 def refusal(capsys, folder: Path, *words: object) -> str:
-    """The line on standard error with which a command ends; it prints nothing else, and writes nothing to a folder."""
+    """The line on standard error with which a command ends; it prints nothing else, and writes
+    nothing to a folder."""
     before = sorted(folder.rglob("*"))
     capsys.readouterr()
     with pytest.raises(SystemExit) as end:

@@ -7,9 +7,12 @@ from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Speed
 
 def point(key: str, ms: float, psnr: float, photos: float | None, count: int) -> Point:
     """A point of a scene whose frames take 100 ms."""
-    speed, against_photos = Speed(*3 * [100 / ms]), None if photos is None else ImageMetrics(photos, 0.8)
+    speed = Speed(*3 * [100 / ms])
+    against_photos = None if photos is None else ImageMetrics(photos, 0.8)
     of = (f"the {key}", f"make {key}", key, 1.0, count, "none", 10 * count)
-    return Point(key, *of, ImageMetrics(psnr, 0.9), against_photos, speed, ms, fill=1.0, seconds=3.0)
+    return Point(
+        key, *of, ImageMetrics(psnr, 0.9), against_photos, speed, ms, fill=1.0, seconds=3.0
+    )
 
 
 POINTS = [

@@ -17,9 +17,9 @@ from pointsplat_ns.system.threads import fixed_threads
 
 @contextmanager
 def all_settings():
-    """Within, numbers without a type are float64, tensors without a device are made on "meta", where they have no
-    numbers, and torch refuses operations that may give other bits, fills memory before it is written, and keeps no
-    graph."""
+    """Within, numbers without a type are float64, tensors without a device are made on "meta",
+    where they have no numbers, and torch refuses operations that may give other bits, fills memory
+    before it is written, and keeps no graph."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     torch.set_default_device("meta")
@@ -38,7 +38,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, torch.Tensor):
         return str(value.dtype), str(value.device), value.tolist()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {
+            field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)
+        }
     if isinstance(value, dict):
         return {name: plain(part) for name, part in value.items()}
     return [plain(part) for part in value] if isinstance(value, (tuple, list)) else value
@@ -47,11 +49,14 @@ def plain(value: Any) -> Any:
 def results_of(scene: Path, folder: Path) -> dict[str, Any]:
     room = ps.load(scene)
     views = ps.sample_views(room, 3, width=48, height=36)
-    image, other = ps.render(room, views[0]), ps.render(room[:100], views[0])
+    image = ps.render(room, views[0])
+    other = ps.render(room[:100], views[0])
     found: dict[str, Any] = {"views": views, "image": image}
     found |= {"psnr": ps.psnr(image, other), "ssim": ps.ssim(image, other)}
     for by, method in METHODS.items():
-        found[f"pruned by {by}"] = ps.prune(room, 0.3, by=by, views=views if method.needs_views else None)
+        found[f"pruned by {by}"] = ps.prune(
+            room, 0.3, by=by, views=views if method.needs_views else None
+        )
     found["cleaned and pruned"] = ps.prune(room, 0.3, sh="auto", clean=True, views=views)
     compacted = ps.compact(room, 0.3, views=views)
     repaired = compacted.repaired
@@ -66,11 +71,17 @@ def results_of(scene: Path, folder: Path) -> dict[str, Any]:
         found[suffix] = ps.load(folder / f"room{suffix}")
     found["info"] = ps.info(scene)
     ps.write_page(room, folder / "room.html", views=views)
-    files = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    files = {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
     return {name: plain(value) for name, value in found.items()} | files
 
 
-@fixed_threads(1)  # a network's products depend on their number, which other programs on the machine would change
+@fixed_threads(
+    1
+)  # a network's products depend on their number, which other programs on the machine would change
 def test_the_api_gives_the_same_bits_whatever_torchs_settings(tmp_path, monkeypatch):
     ps.save(box_room(0, count=300), tmp_path / "scene.ply")
     torch.manual_seed(0)

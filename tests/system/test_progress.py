@@ -28,12 +28,21 @@ def stderr(monkeypatch):
 
 
 def test_a_log_gets_a_plain_line_from_time_to_time(stderr, monkeypatch):
-    log, clock = stderr(io.StringIO()), [0.0]
+    log = stderr(io.StringIO())
+    clock = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
     with progress_bar() as report:
-        for clock[0], what, share in ((1, "First", 0.0), (31, "First", 0.25), (40, "First", 1.0), (62, "Second", 1.0)):
+        for clock[0], what, share in (
+            (1, "First", 0.0),
+            (31, "First", 0.25),
+            (40, "First", 1.0),
+            (62, "Second", 1.0),
+        ):
             report(what, share)
-    assert log.getvalue().splitlines() == ["[0:31] First: 25 %, about 1:30 left", "[1:02] Second: 100 %"]
+    assert log.getvalue().splitlines() == [
+        "[0:31] First: 25 %, about 1:30 left",
+        "[1:02] Second: 100 %",
+    ]
 
 
 def test_a_function_hears_the_share_done_after_each_item():

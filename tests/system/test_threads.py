@@ -9,14 +9,26 @@ import torch
 from pointsplat_ns.system import cores as cores_module
 from pointsplat_ns.system import threads as threads_module
 from pointsplat_ns.system.cores import OtherPrograms, cores
-from pointsplat_ns.system.threads import fixed_threads, in_threads, in_turn, most_threads, one_thread_each
+from pointsplat_ns.system.threads import (
+    fixed_threads,
+    in_threads,
+    in_turn,
+    most_threads,
+    one_thread_each,
+)
 
 CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize(
     ("variable", "allowed", "quota", "threads"),
-    [(None, 16, 64.0, 12), (None, 4, 64.0, 4), (None, 16, 2.5, 2), (None, 16, 0.1, 1), ("12", 4, 2.5, 12)],
+    [
+        (None, 16, 64.0, 12),
+        (None, 4, 64.0, 4),
+        (None, 16, 2.5, 2),
+        (None, 16, 0.1, 1),
+        ("12", 4, 2.5, 12),
+    ],
 )
 def test_as_many_threads_share_work_as_there_are_cores_unless_the_user_says_so(
     monkeypatch, variable, allowed, quota, threads
@@ -52,13 +64,16 @@ def test_results_come_in_order_from_threads_of_the_callers_mode(inside):
 
     for grad in (True, False):
         with fixed_threads(2), torch.set_grad_enabled(grad):
-            assert [*in_turn(look, range(5), CPU, inside)] == [(item, inside, inside, grad) for item in range(5)]
+            assert [*in_turn(look, range(5), CPU, inside)] == [
+                (item, inside, inside, grad) for item in range(5)
+            ]
             assert [*in_turn(look, [7], CPU)] == [(7, 2, 2, grad)], "one piece of work is done here"
 
 
 @pytest.mark.parametrize("error", [KeyError, KeyboardInterrupt])
 def test_nothing_runs_any_more_after_an_error(error):
-    ended, begun = [], threading.Event()
+    ended = []
+    begun = threading.Event()
 
     def work(item: int) -> None:
         if item == 0:
@@ -84,9 +99,11 @@ def test_threads_are_started_once():
 
 
 def test_a_real_look_sees_what_others_leave():
-    others, end = OtherPrograms(), time.process_time() + 0.3
+    others = OtherPrograms()
+    end = time.process_time() + 0.3
     while time.process_time() < end:
         pass
-    (start, own, limit, used), (now, own_after, _, used_after) = others.before, cores_module._usage()
+    (start, own, limit, used) = others.before
+    (now, own_after, _, used_after) = cores_module._usage()
     assert limit >= cores() and used_after - used > 0.2 and now > start and own_after > own
     assert 0 <= others.cores() <= cores()

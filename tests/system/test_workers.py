@@ -32,8 +32,13 @@ def test_processes_have_the_users_number_of_threads_where_torch_has_one_here():
 
 
 def test_a_process_that_is_killed_ends_the_work_with_one_error():
-    with Workers(where, 2) as workers, pytest.raises(PointSplatError, match="a process was killed, as happens where"):
-        list(workers.results([1.0, -0.1]))  # noticed at the latest when another process has a result
+    with (
+        Workers(where, 2) as workers,
+        pytest.raises(PointSplatError, match="a process was killed, as happens where"),
+    ):
+        list(
+            workers.results([1.0, -0.1])
+        )  # noticed at the latest when another process has a result
 
 
 def test_one_job_is_done_in_this_process_and_none_is_refused():

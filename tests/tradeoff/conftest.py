@@ -30,10 +30,12 @@ def room_views(room) -> Views:
 
 @pytest.fixture()
 def measured(room, room_views, tmp_path, monkeypatch) -> Callable[..., Tradeoff]:
-    """A function that measures the room in these views, by default merged to a tenth, to the folder ``out``. Repairs
-    take two steps."""
+    """A function that measures the room in these views, by default merged to a tenth, to the folder
+    ``out``. Repairs take two steps."""
     monkeypatch.setitem(repair.STEPS, "quick", 2)
-    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
+    monkeypatch.setattr(
+        view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count]
+    )
 
     def measure(**options) -> Tradeoff:
         usual = {"keep": ["10%"], "repairs": ["none"]}

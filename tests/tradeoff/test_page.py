@@ -1,4 +1,5 @@
-"""The page of a tradeoff: a file that needs no other, opened from disk in headless Chromium and used."""
+"""The page of a tradeoff: a file that needs no other, opened from disk in headless Chromium and
+used."""
 
 import html
 from dataclasses import replace
@@ -14,16 +15,26 @@ from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.tradeoff.table import write_page
 from trades import POINTS
 
-HOSTILE = "<script>document.title='run'</script><img src=x onerror=\"document.title='run'\">\"'&</title>"
+HOSTILE = (
+    "<script>document.title='run'</script><img src=x onerror=\"document.title='run'\">\"'&</title>"
+)
 
 
 def written(output: Path, points=POINTS, photos: bool = True, **changed) -> Path:
     """The page of a made-up tradeoff of two views; each picture has another grey."""
     keys = [point.key for point in points] + ["photo"] * photos
-    greys = [[np.full((24, 32, 3), 90 * view + 9 * n, np.uint8) for n in range(len(keys))] for view in range(2)]
+    greys = [
+        [np.full((24, 32, 3), 90 * view + 9 * n, np.uint8) for n in range(len(keys))]
+        for view in range(2)
+    ]
     pictures = [dict(zip(keys, map(picture_uri, grey), strict=True)) for grey in greys]
     points = points if photos else [replace(point, against_photos=None) for point in points]
-    known = {"recommended": "third", "why": "the fastest", "notes": ("busy",), "judged_in": "2 views of 32 x 24 pixels"}
+    known = {
+        "recommended": "third",
+        "why": "the fastest",
+        "notes": ("busy",),
+        "judged_in": "2 views of 32 x 24 pixels",
+    }
     texts = {"scene": "room", "machine": "a machine", "views_origin": "sampled", **known, **changed}
     write_page(Tradeoff(width=32, height=24, points=tuple(points), **texts), pictures, output)
     return output
@@ -34,30 +45,49 @@ def test_it_names_nothing_outside_and_has_every_figure(photos, tmp_path):
     path = written(tmp_path / "page.html", photos=photos)
     names_nothing_outside(path)
     parts = parts_of(path)
-    assert [a["data-key"] for tag, a in parts.elements if tag == "tr" and "data-key" in a] == [p.key for p in POINTS]
-    assert [p["key"] for p in parts.data["points"]] == [p.key for p in POINTS] and parts.data["shown"] == "third"
+    assert [a["data-key"] for tag, a in parts.elements if tag == "tr" and "data-key" in a] == [
+        p.key for p in POINTS
+    ]
+    assert [p["key"] for p in parts.data["points"]] == [p.key for p in POINTS] and parts.data[
+        "shown"
+    ] == "third"
     text = path.read_text("utf-8")
-    assert "<td>36.00</td>" in text and "<td>identical</td>" in text and ("<td>29.60</td>" in text) == photos
+    assert (
+        "<td>36.00</td>" in text
+        and "<td>identical</td>" in text
+        and ("<td>29.60</td>" in text) == photos
+    )
     assert "make third" in text and "hardly any difference" in text
     dense = written(tmp_path / "dense.html", recommended="dense")
     assert parts_of(dense).data["shown"] == "half", "beside the dense scene stands what loses least"
 
 
 def test_texts_of_strangers_are_shown_and_never_run(tmp_path):
-    points = [replace(point, label=HOSTILE, command=HOSTILE, by=HOSTILE, repair=HOSTILE) for point in POINTS]
+    points = [
+        replace(point, label=HOSTILE, command=HOSTILE, by=HOSTILE, repair=HOSTILE)
+        for point in POINTS
+    ]
     texts = dict.fromkeys(("scene", "machine", "views_origin", "why", "judged_in"), HOSTILE)
     path = written(tmp_path / "page.html", points, notes=(HOSTILE,), **texts)
-    parts, text = parts_of(path), path.read_text("utf-8")
-    assert len(parts.inside["script"]) == 2 and all("onerror" not in attributes for _, attributes in parts.elements)
+    parts = parts_of(path)
+    text = path.read_text("utf-8")
+    assert len(parts.inside["script"]) == 2 and all(
+        "onerror" not in attributes for _, attributes in parts.elements
+    )
     assert parts.data["points"][1]["command"] == HOSTILE, "scripts read the text as it is"
     assert HOSTILE not in text and "<script>document" not in text
-    assert text.count(html.escape(HOSTILE).replace("&quot;", "&#34;").replace("&#x27;", "&#39;")) >= 8
+    assert (
+        text.count(html.escape(HOSTILE).replace("&quot;", "&#34;").replace("&#x27;", "&#39;")) >= 8
+    )
 
 
 def shown(browser) -> dict[str, str]:
     """What is seen of the point that is shown."""
     ids = ("shown-name", "shown-figures", "shown-command", "wipe-left", "wipe-right")
-    script = "return Object.fromEntries(arguments[0].map((id) => [id, document.getElementById(id).textContent]))"
+    script = (
+        "return Object.fromEntries(arguments[0].map((id) => [id, "
+        "document.getElementById(id).textContent]))"
+    )
     return browser.execute_script(script, ids)
 
 
@@ -69,10 +99,18 @@ def test_points_of_the_chart_and_the_table_are_looked_at(text, browser, tmp_path
     pictures = parts_of(path).data["pictures"]
     browser.get(path.as_uri())
     click = "document.querySelector(arguments[0]).dispatchEvent(new Event('click'))"
-    sources = "return ['over', 'under'].map((place) => document.getElementById(`wipe-${place}`).src)"
-    assert shown(browser)["shown-name"] == text + "the third" and shown(browser)["wipe-right"] == "photo, held out"
+    sources = (
+        "return ['over', 'under'].map((place) => document.getElementById(`wipe-${place}`).src)"
+    )
+    assert (
+        shown(browser)["shown-name"] == text + "the third"
+        and shown(browser)["wipe-right"] == "photo, held out"
+    )
     browser.execute_script(click, "circle[data-key='tenth']")
-    assert "28.0 dB against photos, 30.0 dB against the dense scene, 5 times as fast" in shown(browser)["shown-figures"]
+    assert (
+        "28.0 dB against photos, 30.0 dB against the dense scene, 5 times as fast"
+        in shown(browser)["shown-figures"]
+    )
     assert shown(browser)["shown-command"].strip() == "make tenth"
     browser.execute_script(click, "tr[data-key='half'] button")
     assert shown(browser)["wipe-left"] == text + "the half"
@@ -86,8 +124,13 @@ def test_points_of_the_chart_and_the_table_are_looked_at(text, browser, tmp_path
         browser.execute_script(f"document.querySelector('[name=cost][value={cost}]').click()")
         found = {key: (x, y) for key, x, y in browser.execute_script(circles)}
         assert {*found} == {point.key for point in POINTS[1:]}, "the dense scene is as itself"
-        assert found["tenth"][0] < found["third"][0] < found["half"][0] and found["tenth"][1] > found["half"][1]
-    drawn = "return [...document.images].every((image) => image.complete && image.naturalWidth === 32)"
+        assert (
+            found["tenth"][0] < found["third"][0] < found["half"][0]
+            and found["tenth"][1] > found["half"][1]
+        )
+    drawn = (
+        "return [...document.images].every((image) => image.complete && image.naturalWidth === 32)"
+    )
     assert browser.execute_script(drawn) and complaints(browser) == [] and browser.title != "run"
 
 
@@ -99,9 +142,13 @@ def test_it_fits_a_phone_and_its_table_a_laptop(browser, tmp_path):
     for width in (390, 1280):
         size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 1000}
         browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        found[width] = browser.execute_script(f"return {boxes}.map((box) => [box.scrollWidth, box.clientWidth])")
+        found[width] = browser.execute_script(
+            f"return {boxes}.map((box) => [box.scrollWidth, box.clientWidth])"
+        )
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert found[390][0][0] == 390 and found[1280][1][0] == found[1280][1][1], "no column is cut off"
+    assert found[390][0][0] == 390 and found[1280][1][0] == found[1280][1][1], (
+        "no column is cut off"
+    )
 
 
 @pytest.mark.xdist_group("browser")

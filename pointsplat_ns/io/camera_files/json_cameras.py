@@ -1,14 +1,15 @@
 """Cameras in JSON: nerfstudio's ``transforms.json``, and INRIA's ``cameras.json``.
 
-``transforms.json`` is that of nerfstudio and instant-ngp. ``frames`` have ``transform_matrix``, from camera to world,
-OpenGL axes (x right, y up, z back). ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` and the distortion stand in each
-frame or once for all; for focal lengths there may be ``camera_angle_x``, the horizontal field of view in radians.
-``applied_transform`` (3 x 4) and ``applied_scale`` say how the world of the original photos was moved before the file
-was saved.
+``transforms.json`` is that of nerfstudio and instant-ngp. ``frames`` have ``transform_matrix``,
+from camera to world, OpenGL axes (x right, y up, z back). ``fl_x``, ``fl_y``, ``cx``, ``cy``,
+``w``, ``h`` and the distortion stand in each frame or once for all; for focal lengths there may be
+``camera_angle_x``, the horizontal field of view in radians. ``applied_transform`` (3 x 4) and
+``applied_scale`` say how the world of the original photos was moved before the file was saved.
 
-INRIA's training of 3D Gaussian Splatting writes ``cameras.json`` beside its scenes: a list of cameras with ``id``,
-``img_name``, ``width``, ``height``, ``position`` (3), ``rotation`` (3 x 3, camera to world, OpenCV axes), ``fx`` and
-``fy``. The principal point is the picture's centre. Poses are in the scene's frame.
+INRIA's training of 3D Gaussian Splatting writes ``cameras.json`` beside its scenes: a list of
+cameras with ``id``, ``img_name``, ``width``, ``height``, ``position`` (3), ``rotation`` (3 x 3,
+camera to world, OpenCV axes), ``fx`` and ``fy``. The principal point is the picture's centre. Poses
+are in the scene's frame.
 """
 
 from __future__ import annotations
@@ -20,21 +21,42 @@ from typing import Any
 import torch
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, Motion, finite, matrix, need_count, rigid
+from pointsplat_ns.io.camera_files.cameras import (
+    Camera,
+    CameraFile,
+    Motion,
+    finite,
+    matrix,
+    need_count,
+    rigid,
+)
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
 def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
-    """The cameras in the JSON of a ``transforms.json``. Raises DataError if a frame has no usable pose or intrinsics,
-    or a camera has no focal length (a panorama)."""
+    """The cameras in the JSON of a ``transforms.json``. Raises DataError if a frame has no usable
+    pose or intrinsics, or a camera has no focal length (a panorama)."""
     frames = content["frames"]
     need_count(path, len(frames))
     distortion = ("k1", "k2", "k3", "k4", "p1", "p2")
-    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model", *distortion)
+    names = (
+        "fl_x",
+        "fl_y",
+        "cx",
+        "cy",
+        "w",
+        "h",
+        "camera_angle_x",
+        "camera_angle_y",
+        "camera_model",
+        *distortion,
+    )
     found = []
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
-            raise DataError(f"{path}: camera {index} is no frame; expected an object with 'transform_matrix'")
+            raise DataError(
+                f"{path}: camera {index} is no frame; expected an object with 'transform_matrix'"
+            )
         # A frame may have none of these, or hundreds of others.
         said = {name: frame.get(name, content.get(name)) for name in names}
         found.append(_camera(frame, said, index, path))
@@ -52,23 +74,49 @@ def _pose(rows: Any) -> list[float] | None:
 
 def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path) -> Camera:
     kind = said["camera_model"]
-    lenses = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE")
+    lenses = (
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "FISHEYE",
+    )
     if kind is not None and kind not in lenses:  # one without a focal length
-        raise DataError(f"{path}: camera {index} is {str(kind)[:40]!r}; expected one of {', '.join(lenses)}")
-    width, height = finite(said["w"]), finite(said["h"])
+        raise DataError(
+            f"{path}: camera {index} is {str(kind)[:40]!r}; expected one of {', '.join(lenses)}"
+        )
+    width = finite(said["w"])
+    height = finite(said["h"])
     if width is None or height is None:
         raise DataError(f"{path}: camera {index} has no size; expected numbers 'w' and 'h', pixels")
     fx = finite(said["fl_x"]) or _focal(width, finite(said["camera_angle_x"]))
     fy = finite(said["fl_y"]) or _focal(height, finite(said["camera_angle_y"])) or fx
     if fx is None or fy is None:
-        raise DataError(f"{path}: camera {index} has no focal length; expected a number 'fl_x' or 'camera_angle_x'")
-    cx, cy = finite(said["cx"]), finite(said["cy"])
+        raise DataError(
+            f"{path}: camera {index} has no focal length; expected a number 'fl_x' or "
+            "'camera_angle_x'"
+        )
+    cx = finite(said["cx"])
+    cy = finite(said["cy"])
     pose = _pose(frame.get("transform_matrix"))
     if pose is None:
-        raise DataError(f"{path}: camera {index} has no pose; expected 'transform_matrix', 4 x 4 numbers")
-    name, mask = (text if isinstance(text, str) else "" for text in (frame.get("file_path"), frame.get("mask_path")))
+        raise DataError(
+            f"{path}: camera {index} has no pose; expected 'transform_matrix', 4 x 4 numbers"
+        )
+    name, mask = (
+        text if isinstance(text, str) else ""
+        for text in (frame.get("file_path"), frame.get("mask_path"))
+    )
     fisheye = kind in ("OPENCV_FISHEYE", "FISHEYE")
-    model = "OPENCV_FISHEYE" if fisheye else "FULL_OPENCV, with k4" if finite(said["k4"]) else "FULL_OPENCV"
+    model = (
+        "OPENCV_FISHEYE"
+        if fisheye
+        else "FULL_OPENCV, with k4"
+        if finite(said["k4"])
+        else "FULL_OPENCV"
+    )
     order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     return Camera(
         name,
@@ -99,8 +147,8 @@ def _saved_motion(content: dict[str, Any], path: Path) -> Motion:
         transform = torch.empty(0, **FLOATS)
     if transform.shape != (3, 4) or scale is None or not 0 < scale:
         raise DataError(
-            f"{path}: its 'applied_transform' or 'applied_scale' is not usable; expected 3 x 4 numbers and a number "
-            "above 0"
+            f"{path}: its 'applied_transform' or 'applied_scale' is not usable; expected 3 x 4 "
+            "numbers and a number above 0"
         )
     return Motion(rigid(transform[None], f"{path}: its 'applied_transform'")[0], scale)
 
@@ -113,15 +161,19 @@ def inria_cameras(content: list[Any], path: Path) -> CameraFile:
 
 def _inria_camera(entry: Any, index: int, path: Path) -> Camera:
     entry = entry if isinstance(entry, dict) else {}
-    rotation, position = matrix(entry.get("rotation"), (3,), 3), matrix([entry.get("position")], (1,), 3)
+    rotation = matrix(entry.get("rotation"), (3,), 3)
+    position = matrix([entry.get("position")], (1,), 3)
     if rotation is None or position is None:
         raise DataError(
-            f"{path}: camera {index} has no pose; expected 'rotation', 3 x 3 numbers, and 'position', 3 numbers, as "
-            "3DGS training writes them"
+            f"{path}: camera {index} has no pose; expected 'rotation', 3 x 3 numbers, and "
+            "'position', 3 numbers, as 3DGS training writes them"
         )
     width, height, fx, fy = (finite(entry.get(name)) for name in ("width", "height", "fx", "fy"))
     if width is None or height is None or fx is None or fy is None:
-        raise DataError(f"{path}: camera {index} has no intrinsics; expected numbers 'width', 'height', 'fx' and 'fy'")
+        raise DataError(
+            f"{path}: camera {index} has no intrinsics; expected numbers 'width', 'height', 'fx' "
+            "and 'fy'"
+        )
     rows = [[*row, place] for row, place in zip(rotation, position[0], strict=True)]
     name = entry.get("img_name")
     return Camera(

@@ -1,4 +1,5 @@
-"""What the formats share: how numbers become few bits and come back, and reading untrusted bytes."""
+"""What the formats share: how numbers become few bits and come back, and reading untrusted
+bytes."""
 
 from __future__ import annotations
 
@@ -31,13 +32,27 @@ Array = NDArray[Any]
 
 @contextmanager
 def damage_named(path: Path, kind: str) -> Iterator[None]:
-    """Turn errors of decoders into a :class:`SceneError` that names the file and its kind, such as "SPZ"."""
+    """Turn errors of decoders into a :class:`SceneError` that names the file and its kind, such as
+    "SPZ"."""
     of_decoders = (
-        ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError, SyntaxError, EOFError,
-        NotImplementedError, RuntimeError, struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
-    )  # fmt: skip
+        ValueError,
+        KeyError,
+        TypeError,
+        IndexError,
+        OverflowError,
+        RecursionError,
+        SyntaxError,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+        struct.error,
+        zlib.error,
+        lzma.LZMAError,
+        zipfile.BadZipFile,
+    )
     try:
-        # Bits that mean NaN or Inf are no reason for numpy to warn: such Gaussians are dropped, and counted.
+        # Bits that mean NaN or Inf are no reason for numpy to warn: such Gaussians are dropped, and
+        # counted.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             yield
     except SceneError:
@@ -57,15 +72,16 @@ def load_bytes(path: Path) -> bytes:
 
 
 def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: int) -> None:
-    """Raise a SceneError, before memory is taken, if the header of a compressed file declares more bytes than
-    ``packed`` can hold, or more Gaussians (with ``rest`` SH coefficients per channel beyond the constant one) than fit
-    into memory."""
-    # A compressed byte holds at most 100: 216,000 Gaussians that differ in nothing but their place on a grid have 27,
-    # trained scenes less than 4. A file of any size may hold 4 MB, 200,000 equal Gaussians.
+    """Raise a SceneError, before memory is taken, if the header of a compressed file declares more
+    bytes than ``packed`` can hold, or more Gaussians (with ``rest`` SH coefficients per channel
+    beyond the constant one) than fit into memory."""
+    # A compressed byte holds at most 100: 216,000 Gaussians that differ in nothing but their place
+    # on a grid have 27, trained scenes less than 4. A file of any size may hold 4 MB, 200,000 equal
+    # Gaussians.
     if unpacked > max(1 << 22, 100 * packed):
         raise SceneError(
-            f"{path}: the header declares {count} Gaussians of {unpacked} bytes in all, more than {packed} compressed "
-            "bytes can hold"
+            f"{path}: the header declares {count} Gaussians of {unpacked} bytes in all, more than "
+            f"{packed} compressed bytes can hold"
         )
     require_memory(path, unpacked + 4 * count * (14 + 3 * rest))
 
@@ -74,31 +90,44 @@ class Blocks:
     """Arrays that follow one another in the bytes of a file, from ``start`` on."""
 
     def __init__(self, data: bytes | memoryview, path: Path, start: int = 0):
-        self._data, self._path, self._position = data, path, start
+        self._data = data
+        self._path = path
+        self._position = start
 
     def take(self, dtype: str | np.dtype, *shape: int) -> NDArray:
         """The next array, not copied; a SceneError if the bytes end before it does."""
-        count, left = math.prod(int(side) for side in shape), len(self._data) - self._position
+        count = math.prod(int(side) for side in shape)
+        left = len(self._data) - self._position
         size = count * np.dtype(dtype).itemsize
         if size > left:
-            raise SceneError(f"{self._path}: truncated; {size} bytes expected at byte {self._position}, found {left}")
+            raise SceneError(
+                f"{self._path}: truncated; {size} bytes expected at byte {self._position}, found "
+                f"{left}"
+            )
         array = np.frombuffer(self._data, dtype, count, self._position).reshape(shape)
         self._position += size
         return array
 
 
 def scene_of(
-    means: ArrayLike, scales: ArrayLike, quats: ArrayLike, opacities: ArrayLike, dc: ArrayLike, rest: ArrayLike
+    means: ArrayLike,
+    scales: ArrayLike,
+    quats: ArrayLike,
+    opacities: ArrayLike,
+    dc: ArrayLike,
+    rest: ArrayLike,
 ) -> Gaussians:
-    """The scene, float32, of decoded arrays: means (N, 3), log-scales (N, 3), quaternions (N, 4) wxyz, opacity logits
-    (N,), and SH coefficients (N, 3) and (N, K, 3)."""
+    """The scene, float32, of decoded arrays: means (N, 3), log-scales (N, 3), quaternions (N, 4)
+    wxyz, opacity logits (N,), and SH coefficients (N, 3) and (N, K, 3)."""
     columns = (means, scales, quats, np.reshape(opacities, (-1, 1)), dc, rest)
-    return Gaussians(*(torch.from_numpy(np.array(column, np.float32, order="C")) for column in columns))
+    return Gaussians(
+        *(torch.from_numpy(np.array(column, np.float32, order="C")) for column in columns)
+    )
 
 
 def joined(parts: Sequence[Gaussians], degree: int | None = None) -> Gaussians:
-    """All Gaussians of several scenes, in order, with SH up to a degree, by default the largest of theirs. Bands that a
-    scene does not have are zero."""
+    """All Gaussians of several scenes, in order, with SH up to a degree, by default the largest of
+    theirs. Bands that a scene does not have are zero."""
     if degree is None:
         degree = max((part.sh_degree for part in parts), default=0)
     filled = [Gaussians.empty(degree)]
@@ -111,8 +140,8 @@ def joined(parts: Sequence[Gaussians], degree: int | None = None) -> Gaussians:
 
 
 def logits_of_bytes(levels: Array) -> Array:
-    """Opacity logits of bytes, finite, as some programs drop infinite ones: bytes 0 and 255 count as 0.25 and 254.75,
-    in the middle of what is written as these."""
+    """Opacity logits of bytes, finite, as some programs drop infinite ones: bytes 0 and 255 count
+    as 0.25 and 254.75, in the middle of what is written as these."""
     share = np.clip(levels.astype(np.float64), 0.25, 254.75) / 255
     return np.log(share / (1 - share)).astype(np.float32)
 
@@ -139,8 +168,8 @@ def unit_quats(scene: Gaussians) -> Array:
 
 
 def smallest_three(unit: Array) -> tuple[Array, Array]:
-    """Quaternions (N, 4) of length 1 without their largest component, which is made positive: its index (N,), and the
-    others in order, (N, 3), within +-1/sqrt(2)."""
+    """Quaternions (N, 4) of length 1 without their largest component, which is made positive: its
+    index (N,), and the others in order, (N, 3), within +-1/sqrt(2)."""
     largest = np.abs(unit).argmax(axis=1)
     rows = np.arange(len(unit))
     signed = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
@@ -148,7 +177,8 @@ def smallest_three(unit: Array) -> tuple[Array, Array]:
 
 
 def from_smallest_three(largest: Array, others: Array) -> Array:
-    """Quaternions (N, 4) of what :func:`smallest_three` returns; components that are too long leave the largest 0."""
+    """Quaternions (N, 4) of what :func:`smallest_three` returns; components that are too long leave
+    the largest 0."""
     quats = np.empty((len(others), 4), np.float32)
     np.put_along_axis(quats, _OTHERS[largest], others.astype(np.float32), axis=1)
     left = np.clip(1.0 - np.square(others.astype(np.float64)).sum(axis=1), 0.0, None)

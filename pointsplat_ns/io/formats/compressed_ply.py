@@ -1,7 +1,8 @@
 """PlayCanvas' compressed PLY, read only: 16 bytes a Gaussian, and one for each SH coefficient.
 
-Gaussians are grouped in chunks of 256. For each chunk the file has the bounds of positions, log-scales and colours; a
-Gaussian is four 32-bit words of bits between these bounds, and a quaternion without its largest component.
+Gaussians are grouped in chunks of 256. For each chunk the file has the bounds of positions,
+log-scales and colours; a Gaussian is four 32-bit words of bits between these bounds, and a
+quaternion without its largest component.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ def is_compressed(header: Header) -> bool:
 
 
 def read_compressed_ply(path: Path | str) -> Gaussians:
-    """Read a compressed PLY, of any SH degree up to 3, as :func:`~pointsplat_ns.io.read_scene` does. Raises SceneError
-    if the file is no compressed PLY, is truncated, or does not fit into memory."""
+    """Read a compressed PLY, of any SH degree up to 3, as :func:`~pointsplat_ns.io.read_scene`
+    does. Raises SceneError if the file is no compressed PLY, is truncated, or does not fit into
+    memory."""
     path = require_file(path, "a compressed PLY file")
     with coding.damage_named(path, "compressed PLY"):
         with path.open("rb") as stream:
@@ -42,22 +44,34 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
         count, rest = _checked(header, path)
         require_memory(path, path.stat().st_size + 4 * count * (14 + 3 * rest))
         blocks = Blocks(coding.load_bytes(path), path, header.size)
-        data = {element.name: blocks.take(_dtype(element), element.count) for element in header.elements}
-        return _decode(data["chunk"], data["vertex"], data.get("sh"), rest).replace(**traits_of(header, path)._asdict())
+        data = {
+            element.name: blocks.take(_dtype(element), element.count) for element in header.elements
+        }
+        return _decode(data["chunk"], data["vertex"], data.get("sh"), rest).replace(
+            **traits_of(header, path)._asdict()
+        )
 
 
 def _checked(header: Header, path: Path) -> tuple[int, int]:
-    """The number of Gaussians, and of SH coefficients per channel beyond the constant one; what the header declares is
-    checked against itself and the file's size."""
+    """The number of Gaussians, and of SH coefficients per channel beyond the constant one; what the
+    header declares is checked against itself and the file's size."""
     elements = {element.name: element for element in header.elements}
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
-        raise SceneError(f"{path}: lacks the element {'vertex' if chunk else 'chunk'!r}; expected a compressed PLY")
+        raise SceneError(
+            f"{path}: lacks the element {'vertex' if chunk else 'chunk'!r}; expected a compressed "
+            "PLY"
+        )
     if header.order != "<":
-        raise SceneError(f"{path}: a compressed PLY in another byte order or ASCII; expected binary_little_endian")
+        raise SceneError(
+            f"{path}: a compressed PLY in another byte order or ASCII; expected "
+            "binary_little_endian"
+        )
     listed = [name for element in header.elements for name in element.lists]
     if listed:
-        raise SceneError(f"{path}: property {listed[0]!r} is a list; expected none in a compressed PLY")
+        raise SceneError(
+            f"{path}: property {listed[0]!r} is a list; expected none in a compressed PLY"
+        )
     coloured = all(name in dict(chunk.properties) for name in _BOUNDS[12:])
     needed = [(chunk, "float32", name) for name in (_BOUNDS if coloured else _BOUNDS[:12])]
     for element, kind, name in needed + [(vertex, "uint32", name) for name in _PACKED]:
@@ -65,21 +79,24 @@ def _checked(header: Header, path: Path) -> tuple[int, int]:
             raise SceneError(f"{path}: element {element.name!r} lacks the {kind} property {name!r}")
     wanted = -(-vertex.count // 256)
     if chunk.count != wanted:
-        raise SceneError(f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; expected {wanted}")
+        raise SceneError(
+            f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; expected {wanted}"
+        )
     rest = 0
     if sh is not None:
         rest = len(sh.properties) // 3
         expected = {(f"f_rest_{i}", "uint8") for i in range(3 * rest)}
         if set(sh.properties) != expected or sh.count != vertex.count:
             raise SceneError(
-                f"{path}: element 'sh' has {sh.count} rows of {len(sh.properties)} properties; expected {vertex.count} "
-                "rows of f_rest_0, f_rest_1, ... of type uchar"
+                f"{path}: element 'sh' has {sh.count} rows of {len(sh.properties)} properties; "
+                f"expected {vertex.count} rows of f_rest_0, f_rest_1, ... of type uchar"
             )
         sh_degree_of(rest)
     size = header.size + sum(element.count * element.row_bytes for element in header.elements)
     if size > path.stat().st_size:
         raise SceneError(
-            f"{path}: truncated; {vertex.count} Gaussians declared, {size} bytes; found {path.stat().st_size}"
+            f"{path}: truncated; {vertex.count} Gaussians declared, {size} bytes; found "
+            f"{path.stat().st_size}"
         )
     return vertex.count, rest
 
@@ -95,7 +112,9 @@ def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussia
     def between(shares: Array, names: tuple[str, ...]) -> Array:
         if names[0] not in (chunk.dtype.names or ()):
             return shares
-        low, high = (np.stack([chunk[name] for name in part], axis=1)[of] for part in (names[:3], names[3:]))
+        low, high = (
+            np.stack([chunk[name] for name in part], axis=1)[of] for part in (names[:3], names[3:])
+        )
         return low + (high - low) * shares
 
     coefficients = np.empty((len(vertex), rest, 3), np.float32)
@@ -105,11 +124,15 @@ def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussia
             share = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / 256))
             coefficients[:, i % rest, i // rest] = (share - 0.5) * 8
     # Shift and number of bits of each of three numbers in a word.
-    eleven, ten, eight = ((21, 11), (11, 10), (0, 11)), ((20, 10), (10, 10), (0, 10)), ((24, 8), (16, 8), (8, 8))
+    eleven = ((21, 11), (11, 10), (0, 11))
+    ten = ((20, 10), (10, 10), (0, 10))
+    eight = ((24, 8), (16, 8), (8, 8))
     return coding.scene_of(
         between(_unpack(position, eleven), _BOUNDS[:6]),
         between(_unpack(scale, eleven), _BOUNDS[6:12]),
-        coding.from_smallest_three((rotation >> 30).astype(np.int64), (_unpack(rotation, ten) - 0.5) * 2**0.5),
+        coding.from_smallest_three(
+            (rotation >> 30).astype(np.int64), (_unpack(rotation, ten) - 0.5) * 2**0.5
+        ),
         coding.logits_of_bytes(color & 255),
         (between(_unpack(color, eight), _BOUNDS[12:]) - 0.5) / SH_C0,
         coefficients,
@@ -118,4 +141,7 @@ def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussia
 
 def _unpack(words: Array, bits: tuple[tuple[int, int], ...]) -> Array:
     """Shares in [0, 1], (N, 3), in some bits of words (N,)."""
-    return np.stack([(words >> shift & (1 << n) - 1).astype(np.float32) / ((1 << n) - 1) for shift, n in bits], axis=1)
+    return np.stack(
+        [(words >> shift & (1 << n) - 1).astype(np.float32) / ((1 << n) - 1) for shift, n in bits],
+        axis=1,
+    )

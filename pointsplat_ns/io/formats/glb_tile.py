@@ -1,4 +1,5 @@
-"""Writes the content of 3D Tiles: glTF with the Gaussians as SPZ inside (``KHR_gaussian_splatting``), as ``.glb``."""
+"""Writes the content of 3D Tiles: glTF with the Gaussians as SPZ inside
+(``KHR_gaussian_splatting``), as ``.glb``."""
 
 from __future__ import annotations
 
@@ -14,17 +15,24 @@ TILE_EXTENSIONS = ("KHR_gaussian_splatting", "KHR_gaussian_splatting_compression
 
 
 def encode_tile(scene: Gaussians) -> bytes:
-    """The bytes of a ``.glb`` with the N > 0 Gaussians of a scene, float32 on the CPU, as CesiumJS wants them.
+    """The bytes of a ``.glb`` with the N > 0 Gaussians of a scene, float32 on the CPU, as CesiumJS
+    wants them.
 
-    The scene has z up, as tiles have. Its node turns it to y up, as glTF has, and moves it to its offset. The axes in
-    the SPZ are the scene's.
+    The scene has z up, as tiles have. Its node turns it to y up, as glTF has, and moves it to its
+    offset. The axes in the SPZ are the scene's.
     """
-    packed, (prefix, packing) = encode_spz(scene.replace(offset=None)), TILE_EXTENSIONS
-    bands = [f"SH_DEGREE_{d}_COEF_{index}" for d in range(1, scene.sh_degree + 1) for index in range(2 * d + 1)]
+    packed = encode_spz(scene.replace(offset=None))
+    (prefix, packing) = TILE_EXTENSIONS
+    bands = [
+        f"SH_DEGREE_{d}_COEF_{index}"
+        for d in range(1, scene.sh_degree + 1)
+        for index in range(2 * d + 1)
+    ]
     names = ["POSITION", "COLOR_0", *(f"{prefix}:{name}" for name in ("SCALE", "ROTATION", *bands))]
     shapes = {"COLOR_0": "VEC4", f"{prefix}:ROTATION": "VEC4"}
     accessors: list[dict[str, Any]] = [
-        {"componentType": 5126, "count": len(scene), "type": shapes.get(name, "VEC3")} for name in names
+        {"componentType": 5126, "count": len(scene), "type": shapes.get(name, "VEC3")}
+        for name in names
     ]
     accessors[1].update(componentType=5121, normalized=True)  # bytes; the others are float32
     low, high = scene.means.aminmax(dim=0)
@@ -41,7 +49,9 @@ def encode_tile(scene: Gaussians) -> bytes:
         "extensionsRequired": TILE_EXTENSIONS,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, x, z, -y, 1]}],  # columns
+        "nodes": [
+            {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, x, z, -y, 1]}
+        ],  # columns
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": len(packed)}],
@@ -51,5 +61,9 @@ def encode_tile(scene: Gaussians) -> bytes:
     text += b" " * (-len(text) % 4)
     pad = bytes(-len(packed) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(packed) + len(pad))
-    chunks = [struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(packed) + len(pad), b"BIN\0")]
+    chunks = [
+        struct.pack("<I4s", len(text), b"JSON"),
+        text,
+        struct.pack("<I4s", len(packed) + len(pad), b"BIN\0"),
+    ]
     return b"".join([head, *chunks, packed, pad])

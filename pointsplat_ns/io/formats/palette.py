@@ -14,11 +14,14 @@ LEVELS = 256
 
 
 def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
-    """256 numbers that stand for finite float32 values of any shape, by Lloyd's algorithm (k-means in one dimension):
-    the codebook (256,), ascending, and the index of the nearest entry for each value, uint8 of the same shape."""
+    """256 numbers that stand for finite float32 values of any shape, by Lloyd's algorithm (k-means
+    in one dimension): the codebook (256,), ascending, and the index of the nearest entry for each
+    value, uint8 of the same shape."""
     flat = values.flatten()
     if not flat.numel():
-        return torch.zeros(LEVELS, **FLOATS), torch.zeros(values.shape, dtype=torch.uint8, device="cpu")
+        return torch.zeros(LEVELS, **FLOATS), torch.zeros(
+            values.shape, dtype=torch.uint8, device="cpu"
+        )
     book = _distinct(flat)
     if book is None:
         stride = -(-flat.numel() // (1 << 17))  # a sample is enough
@@ -36,13 +39,18 @@ def _distinct(values: Tensor) -> Tensor | None:
     """The values themselves, if no more than 256 of them differ; the last is repeated."""
     distinct = values[: 2 * LEVELS].unique()
     distinct = distinct if len(distinct) > LEVELS else values.unique()
-    return distinct[torch.arange(LEVELS, **INDICES).clamp_max(len(distinct) - 1)] if len(distinct) <= LEVELS else None
+    return (
+        distinct[torch.arange(LEVELS, **INDICES).clamp_max(len(distinct) - 1)]
+        if len(distinct) <= LEVELS
+        else None
+    )
 
 
 def _spread(values: Tensor) -> Tensor:
-    """256 numbers as dense as the cube root of the density of the values, which is best for the mean squared error
-    where numbers are many (Panter and Dite 1951)."""
-    low, high = float(values.amin()), float(values.amax())
+    """256 numbers as dense as the cube root of the density of the values, which is best for the
+    mean squared error where numbers are many (Panter and Dite 1951)."""
+    low = float(values.amin())
+    high = float(values.amax())
     bins = min(max(values.numel() // 16, 64), 4096)
     density = torch.histc(values, bins, low, high).double().pow(1 / 3)
     below = torch.cat([density.new_zeros(1), density.cumsum(0)])
@@ -57,10 +65,13 @@ def _nearest(book: Tensor, values: Tensor) -> Tensor:
     return torch.bucketize(values, (book[1:] + book[:-1]) / 2)
 
 
-def palette(rows: Tensor, size: int, weights: Tensor, progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
-    """Rows that stand for finite float32 rows (N, D), by k-means in levels: rows are split into clusters, each gets a
-    part of the palette, as large as its squared error, and is split in turn. That takes a small part of the time of
-    k-means with as many clusters at once. If there are no more different rows than entries, they are the palette.
+def palette(
+    rows: Tensor, size: int, weights: Tensor, progress: Callable[[float], None]
+) -> tuple[Tensor, Tensor]:
+    """Rows that stand for finite float32 rows (N, D), by k-means in levels: rows are split into
+    clusters, each gets a part of the palette, as large as its squared error, and is split in turn.
+    That takes a small part of the time of k-means with as many clusters at once. If there are no
+    more different rows than entries, they are the palette.
 
     Args:
         rows: finite float32 rows (N, D).
@@ -72,18 +83,24 @@ def palette(rows: Tensor, size: int, weights: Tensor, progress: Callable[[float]
         The palette (P, D), P a multiple of 64, and the index (N,) of the entry for each row.
     """
     n = len(rows)
-    branches, deepest = 64, 6  # clusters that rows are split into, and how often
+    # clusters that rows are split into, and how often
+    branches = 64
+    deepest = 6
     if (found := _different(rows, size)) is not None:
         return found
     weights = weights.float()
     generator = torch.Generator().manual_seed(0)  # the same input gives the same bits
-    book, index = rows.new_zeros(size, rows.shape[1]), torch.empty(n, **INDICES)
+    book = rows.new_zeros(size, rows.shape[1])
+    index = torch.empty(n, **INDICES)
     waiting = [(torch.arange(n, **INDICES), size, 0)]
     used = done = 0
     while waiting:
         members, k, depth = waiting.pop()
-        part, weight = rows[members], weights[members]
-        at_once = k <= branches or k * len(part) <= 1 << 22  # for fewer, splits take longer and err more
+        part = rows[members]
+        weight = weights[members]
+        at_once = (
+            k <= branches or k * len(part) <= 1 << 22
+        )  # for fewer, splits take longer and err more
         if not at_once and depth < deepest:
             sample = torch.randperm(len(part), generator=generator, device="cpu")[: 1 << 17]
             centres = _means(part[sample], weight[sample], branches, generator)
@@ -91,10 +108,15 @@ def palette(rows: Tensor, size: int, weights: Tensor, progress: Callable[[float]
             counts = torch.bincount(of, minlength=branches)
             groups = members[of.argsort(stable=True)].split(counts.tolist())
             error = weight.double() * (part - centres[of]).double().square().sum(dim=1)
-            share = _apportion(counts, error.new_zeros(branches).index_add_(0, of, error), k).tolist()
-            waiting += [(group, own, depth + 1) for group, own in zip(groups, share, strict=True) if own]
+            share = _apportion(
+                counts, error.new_zeros(branches).index_add_(0, of, error), k
+            ).tolist()
+            waiting += [
+                (group, own, depth + 1) for group, own in zip(groups, share, strict=True) if own
+            ]
             continue
-        # Rows that clusters do not tell apart, as where nearly all are equal, are cut into pieces of one size.
+        # Rows that clusters do not tell apart, as where nearly all are equal, are cut into pieces
+        # of one size.
         if at_once:
             centres = _means(part, weight, k, generator)
             of = _assign(part, centres)
@@ -104,13 +126,15 @@ def palette(rows: Tensor, size: int, weights: Tensor, progress: Callable[[float]
             centres /= torch.bincount(of, minlength=k)[:, None].clamp_min(1)
         index[members] = used + of
         book[used : used + len(centres)] = centres
-        used, done = used + len(centres), done + len(members)
+        used = used + len(centres)
+        done = done + len(members)
         progress(done / n)
     return book, index
 
 
 def _piece_of(rows: Tensor, k: int) -> Tensor:
-    """Which of ``k`` pieces of about one size each row (N, D) is in, along the column that varies most."""
+    """Which of ``k`` pieces of about one size each row (N, D) is in, along the column that varies
+    most."""
     order = rows[:, int(rows.var(dim=0).argmax())].argsort(stable=True)
     pieces = torch.empty(len(rows), **INDICES)
     pieces[order] = torch.arange(len(rows), **INDICES) * k // len(rows)
@@ -118,8 +142,8 @@ def _piece_of(rows: Tensor, k: int) -> Tensor:
 
 
 def _different(rows: Tensor, most: int) -> tuple[Tensor, Tensor] | None:
-    """The rows themselves and the index of each, if at most ``most`` differ; zeros fill the rest up to a multiple of
-    64."""
+    """The rows themselves and the index of each, if at most ``most`` differ; zeros fill the rest up
+    to a multiple of 64."""
     sums = rows.double() @ torch.linspace(1.0, 2.0, rows.shape[1], **DOUBLES).sqrt()
     if len(sums[: 2 * most].unique()) > most:
         return None
@@ -134,8 +158,8 @@ def _different(rows: Tensor, most: int) -> tuple[Tensor, Tensor] | None:
 
 
 def _apportion(counts: Tensor, errors: Tensor, size: int) -> Tensor:
-    """``size`` entries shared out in proportion to errors, float64: at least one where there are members, never
-    more."""
+    """``size`` entries shared out in proportion to errors, float64: at least one where there are
+    members, never more."""
     errors = torch.where(errors.sum() > 0, errors, counts.double())
     share = torch.minimum((errors * size / errors.sum()).floor().long().clamp_min(1), counts)
     order = errors.argsort(descending=True, stable=True)

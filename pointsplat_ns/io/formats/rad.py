@@ -1,7 +1,9 @@
-"""Writes RAD, the format of Spark: a tree of Gaussians in pages of 65,536, of which a viewer loads those that it needs.
+"""Writes RAD, the format of Spark: a tree of Gaussians in pages of 65,536, of which a viewer loads
+those that it needs.
 
-A file is a description in JSON and the pages. A page is a description and an array for each attribute, one component
-after the other, deflated. The root is the first Gaussian, and children of a Gaussian follow one another.
+A file is a description in JSON and the pages. A page is a description and an array for each
+attribute, one component after the other, deflated. The root is the first Gaussian, and children of
+a Gaussian follow one another.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ MOST_CHILDREN = 65535
 _PAGE = 65536
 
 
-def encode_rad(scene: Gaussians, children: Tensor, starts: Tensor, progress: Progress = silent) -> bytes:
+def encode_rad(
+    scene: Gaussians, children: Tensor, starts: Tensor, progress: Progress = silent
+) -> bytes:
     """The bytes of a RAD file.
 
     Args:
@@ -35,7 +39,9 @@ def encode_rad(scene: Gaussians, children: Tensor, starts: Tensor, progress: Pro
         starts: (N,) index of the first child.
         progress: called while compressing.
     """
-    n, degree, encoding = len(scene), scene.sh_degree, _ranges(scene)
+    n = len(scene)
+    degree = scene.sh_degree
+    encoding = _ranges(scene)
     pages: list[bytes] = []
     places: list[dict[str, int]] = []
     offset = 0
@@ -45,19 +51,38 @@ def encode_rad(scene: Gaussians, children: Tensor, starts: Tensor, progress: Pro
         payload: list[bytes] = []
         properties: list[dict[str, Any]] = []
         size = 0
-        for (name, kind, bounds), array in _attributes(scene[rows], encoding, children[rows], starts[rows]):
+        for (name, kind, bounds), array in _attributes(
+            scene[rows], encoding, children[rows], starts[rows]
+        ):
             packer = zlib.compressobj(6, zlib.DEFLATED, -15)  # 9 takes three times as long for 1 %
             packed = packer.compress(array.tobytes()) + packer.flush()
-            about = {"offset": size, "bytes": len(packed), "property": name, "encoding": kind, "compression": "gz"}
+            about = {
+                "offset": size,
+                "bytes": len(packed),
+                "property": name,
+                "encoding": kind,
+                "compression": "gz",
+            }
             properties.append({**about, **bounds})
             payload.append(_padded(packed))
             size += len(payload[-1])
-        page: dict[str, Any] = {"version": 1, "base": first, "count": len(children[rows]), "payloadBytes": size}
+        page: dict[str, Any] = {
+            "version": 1,
+            "base": first,
+            "count": len(children[rows]),
+            "payloadBytes": size,
+        }
         page.update(maxSh=degree, lodTree=True, splatEncoding=encoding, properties=properties)
         pages.append(b"".join([_described(b"RADC", page), struct.pack("<Q", size), *payload]))
         places.append({"offset": offset, "bytes": len(pages[-1])})
         offset += len(pages[-1])
-    head: dict[str, Any] = {"version": 1, "type": "gsplat", "count": n, "maxSh": degree, "lodTree": True}
+    head: dict[str, Any] = {
+        "version": 1,
+        "type": "gsplat",
+        "count": n,
+        "maxSh": degree,
+        "lodTree": True,
+    }
     head.update(chunkSize=_PAGE, allChunkBytes=offset, chunks=places, splatEncoding=encoding)
     if scene.offset is not None:
         head["comment"] = f"Offset: {offset_text(scene.offset)}"
@@ -99,9 +124,13 @@ def _band(scene: Gaussians, degree: int) -> Tensor:
 def _attributes(
     scene: Gaussians, encoding: dict[str, Any], children: Tensor, starts: Tensor
 ) -> Iterator[tuple[tuple[str, str, dict[str, float]], Array]]:
-    """Each attribute of a page: its name, encoding and range, and its array, one component after the other."""
-    low, high = encoding["rgbMin"], encoding["rgbMax"]
-    bytes_of_means = np.ascontiguousarray(scene.means.numpy().T.astype("<f4")).view(np.uint8).reshape(3, -1, 4)
+    """Each attribute of a page: its name, encoding and range, and its array, one component after
+    the other."""
+    low = encoding["rgbMin"]
+    high = encoding["rgbMax"]
+    bytes_of_means = (
+        np.ascontiguousarray(scene.means.numpy().T.astype("<f4")).view(np.uint8).reshape(3, -1, 4)
+    )
     yield ("center", "f32_lebytes", {}), np.ascontiguousarray(bytes_of_means.transpose(2, 0, 1))
     yield ("alpha", "f16", {}), scene.alphas.numpy().astype("<f2")
     colours = to_bytes(255 * (shares_of_dc(scene) - low) / (high - low))
@@ -117,12 +146,18 @@ def _attributes(
 
 
 def _turns(quats: Array) -> Array:
-    """Rotations (N, 4) wxyz as (N, 3) bytes: the axis on an octahedron unfolded to a square, and the angle."""
+    """Rotations (N, 4) wxyz as (N, 3) bytes: the axis on an octahedron unfolded to a square, and
+    the angle."""
     positive = np.where(quats[:, :1] < 0, -quats, quats)
-    axes, length = positive[:, 1:], np.linalg.norm(positive[:, 1:], axis=1)
+    axes = positive[:, 1:]
+    length = np.linalg.norm(positive[:, 1:], axis=1)
     axes = np.where(length[:, None] > 1e-6, axes, [1.0, 0.0, 0.0])
     x, y, z = (axes / np.abs(axes).sum(axis=1, keepdims=True)).T
-    sign_x, sign_y = np.where(x < 0, -1.0, 1.0), np.where(y < 0, -1.0, 1.0)
-    folded = [np.where(z < 0, (1 - np.abs(y)) * sign_x, x), np.where(z < 0, (1 - np.abs(x)) * sign_y, y)]
+    sign_x = np.where(x < 0, -1.0, 1.0)
+    sign_y = np.where(y < 0, -1.0, 1.0)
+    folded = [
+        np.where(z < 0, (1 - np.abs(y)) * sign_x, x),
+        np.where(z < 0, (1 - np.abs(x)) * sign_y, y),
+    ]
     angle = 2 * np.arctan2(length, positive[:, 0]) / np.pi
     return to_bytes(255 * np.stack([0.5 * (folded[0] + 1), 0.5 * (folded[1] + 1), angle], axis=1))

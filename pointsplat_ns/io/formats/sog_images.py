@@ -18,8 +18,8 @@ SOG_META = "meta.json"
 
 
 class Images:
-    """The parts of one SOG file: a zip archive, a folder, or the ``meta.json`` in one. Errors are as
-    :func:`~pointsplat_ns.io.formats.coding.damage_named` has them, and SceneErrors."""
+    """The parts of one SOG file: a zip archive, a folder, or the ``meta.json`` in one. Errors are
+    as :func:`~pointsplat_ns.io.formats.coding.damage_named` has them, and SceneErrors."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -46,7 +46,9 @@ class Images:
         """The content of ``meta.json``."""
         content = json.loads(self._bytes(SOG_META, 1 << 22))  # one has about 20 kB
         if not isinstance(content, dict):
-            raise SceneError(f"{self.path}: {SOG_META} holds a {type(content).__name__}; expected an object")
+            raise SceneError(
+                f"{self.path}: {SOG_META} holds a {type(content).__name__}; expected an object"
+            )
         return content
 
     def pixels(self, name: Any, least: int, width: int | None = None) -> Array:
@@ -63,8 +65,13 @@ class Images:
         from PIL import Image
 
         if not isinstance(name, str) or PurePosixPath(name).name != name or "\\" in name:
-            raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {SOG_META}")
-        most = 6 * least + (1 << 16)  # version 1 leaves open which of 3, 8 and 15 SH; some programs round sides up
+            raise SceneError(
+                f"{self.path}: an image called {name!r}; expected the name of a file beside "
+                f"{SOG_META}"
+            )
+        most = 6 * least + (
+            1 << 16
+        )  # version 1 leaves open which of 3, 8 and 15 SH; some programs round sides up
         data = self._bytes(name, 4 * most)
         across, down = webp_size(data)  # opening an image takes the memory of its pixels already
         if across * down < least or across * down > most or width not in (None, across):
@@ -83,9 +90,15 @@ class Images:
             part = require_file(self._folder / name, "a part of a SOG folder")
             size = part.stat().st_size
         else:
-            entries = [entry for entry in self._zip.infolist() if PurePosixPath(entry.filename).name == name]
+            entries = [
+                entry
+                for entry in self._zip.infolist()
+                if PurePosixPath(entry.filename).name == name
+            ]
             if len(entries) != 1:
-                raise SceneError(f"{self.path}: holds {len(entries)} files called {name}; expected one")
+                raise SceneError(
+                    f"{self.path}: holds {len(entries)} files called {name}; expected one"
+                )
             size = entries[0].file_size
         if size > most:
             raise SceneError(f"{self.path}: {name} has {size} bytes; expected at most {most}")
@@ -94,8 +107,10 @@ class Images:
 
 
 def webp_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a WebP image in pixels, as its header says (RFC 9649); a ValueError if it is none."""
-    kind, head = data[12:16], data[20:30]
+    """Width and height of a WebP image in pixels, as its header says (RFC 9649); a ValueError if it
+    is none."""
+    kind = data[12:16]
+    head = data[20:30]
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(head) == 10:
         if kind == b"VP8X":
             return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
@@ -103,12 +118,15 @@ def webp_size(data: bytes) -> tuple[int, int]:
             bits = int.from_bytes(head[1:5], "little")
             return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
         if kind == b"VP8 ":
-            return int.from_bytes(head[6:8], "little") & 0x3FFF, int.from_bytes(head[8:10], "little") & 0x3FFF
+            return int.from_bytes(head[6:8], "little") & 0x3FFF, int.from_bytes(
+                head[8:10], "little"
+            ) & 0x3FFF
     raise ValueError("not a WebP image")
 
 
 def webp(pixels: Array, width: int, height: int) -> bytes:
-    """A lossless WebP image of pixels (up to width * height, 3 or 4), uint8; the rest is filled with zeros."""
+    """A lossless WebP image of pixels (up to width * height, 3 or 4), uint8; the rest is filled
+    with zeros."""
     from PIL import Image
 
     full = np.zeros((height * width, pixels.shape[1]), np.uint8)

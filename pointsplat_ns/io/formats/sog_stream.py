@@ -1,7 +1,9 @@
-"""Streamed SOG: PlayCanvas' folder of SOG files for viewers that load the parts of a scene that they need.
+"""Streamed SOG: PlayCanvas' folder of SOG files for viewers that load the parts of a scene that
+they need.
 
-``lod-meta.json`` holds a tree of boxes. A leaf names for each level of detail, the finest first, consecutive rows of
-one SOG folder, ``LEVEL_NUMBER/meta.json``. A viewer draws one level of every leaf. The scene that is read is one level.
+``lod-meta.json`` holds a tree of boxes. A leaf names for each level of detail, the finest first,
+consecutive rows of one SOG folder, ``LEVEL_NUMBER/meta.json``. A viewer draws one level of every
+leaf. The scene that is read is one level.
 """
 
 from __future__ import annotations
@@ -49,8 +51,8 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
         level: 0 is the finest.
 
     Raises:
-        SceneError: if there is no such level, a file is missing, damaged or lies outside the folder, or has another
-            number of Gaussians than the tree says.
+        SceneError: if there is no such level, a file is missing, damaged or lies outside the
+            folder, or has another number of Gaussians than the tree says.
     """
     path = Path(path)
     path = path / STREAM_META if path.is_dir() else path
@@ -68,14 +70,16 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
     for file, count in files.items():
         parts.append(read_sog(file))
         if count != len(parts[-1]):
-            raise SceneError(f"{file}: {len(parts[-1])} Gaussians; {STREAM_META} names {count} of level {level}")
+            raise SceneError(
+                f"{file}: {len(parts[-1])} Gaussians; {STREAM_META} names {count} of level {level}"
+            )
     return joined([*parts, *map(read_sog, around)])
 
 
 def coarser_levels(path: Path, finest: int) -> list[Gaussians]:
-    """All levels of a streamed SOG but the finest, which has ``finest`` Gaussians, the finer first; no more of them
-    than have twice as many Gaussians in all. None for a path that is no streamed SOG. Raises SceneError as
-    :func:`read_sog_stream`."""
+    """All levels of a streamed SOG but the finest, which has ``finest`` Gaussians, the finer first;
+    no more of them than have twice as many Gaussians in all. None for a path that is no streamed
+    SOG. Raises SceneError as :func:`read_sog_stream`."""
     path = path / STREAM_META if path.is_dir() else path
     if path.name != STREAM_META or not path.is_file():
         return []
@@ -90,14 +94,16 @@ def coarser_levels(path: Path, finest: int) -> list[Gaussians]:
 
 
 def stream_parts(path: Path) -> list[Path]:
-    """All files of the streamed SOG with this ``lod-meta.json``, which comes first. Raises SceneError as
-    :func:`read_sog_stream`."""
+    """All files of the streamed SOG with this ``lod-meta.json``, which comes first. Raises
+    SceneError as :func:`read_sog_stream`."""
     with damage_named(path, "streamed SOG"):
         meta = _meta(path)
         names = [name for name in (*meta["filenames"], meta.get("environment")) if name is not None]
         found = [path]
         for file in (_beside(path, name) for name in names):
-            found += [file] if file.name != SOG_META else sorted(file.parent.glob("*.webp")) + [file]
+            found += (
+                [file] if file.name != SOG_META else sorted(file.parent.glob("*.webp")) + [file]
+            )
         return found
 
 
@@ -106,7 +112,8 @@ def write_sog_stream(
 ) -> dict[str, Any]:
     """Write a streamed SOG: all of it, or nothing.
 
-    All files are written beside before the first replaces an older one. Meanwhile there is no ``lod-meta.json``.
+    All files are written beside before the first replaces an older one. Meanwhile there is no
+    ``lod-meta.json``.
 
     Args:
         levels: the finest first; float32 on the CPU, of Gaussians that can be drawn.
@@ -129,7 +136,8 @@ def write_sog_stream(
         file = last.get(level, -1)
         held = sum(map(len, files[file][1])) if file >= 0 else 0
         if file < 0 or held > chunk:
-            file, held = len(files), 0
+            file = len(files)
+            held = 0
             names.append(f"{level}_{sum(level == other for other, _ in files)}/{SOG_META}")
             files.append((level, []))
             last[level] = file
@@ -139,15 +147,27 @@ def write_sog_stream(
     def node(part: Node) -> dict[str, Any]:
         if part.children:
             children = [node(child) for child in part.children]
-            lows, highs = zip(*((child["bound"]["min"], child["bound"]["max"]) for child in children), strict=True)
+            lows, highs = zip(
+                *((child["bound"]["min"], child["bound"]["max"]) for child in children), strict=True
+            )
             bound = {"min": [min(axis) for axis in zip(*lows, strict=True)]}
-            return {"bound": bound | {"max": [max(axis) for axis in zip(*highs, strict=True)]}, "children": children}
-        lods = {str(level): entry(level, members) for level, members in enumerate(part.rows) if len(members)}
+            return {
+                "bound": bound | {"max": [max(axis) for axis in zip(*highs, strict=True)]},
+                "children": children,
+            }
+        lods = {
+            str(level): entry(level, members)
+            for level, members in enumerate(part.rows)
+            if len(members)
+        }
         bound = _bound([scene[members] for scene, members in zip(levels, part.rows, strict=True)])
         return {"bound": bound, "lods": lods}
 
     described = node(tree)
-    counts = [sum(len(part) for at, parts in files if at == level for part in parts) for level in range(len(levels))]
+    counts = [
+        sum(len(part) for at, parts in files if at == level for part in parts)
+        for level in range(len(levels))
+    ]
     meta = {
         "version": 1,
         "asset": {"generator": "pointsplat-ns"},
@@ -160,7 +180,9 @@ def write_sog_stream(
     }
     with ExitStack() as stack:
         # Left in the opposite order: lod-meta.json comes last.
-        stack.enter_context(replacing(path)).write_text(json.dumps(meta, separators=(",", ":")), "utf-8")
+        stack.enter_context(replacing(path)).write_text(
+            json.dumps(meta, separators=(",", ":")), "utf-8"
+        )
         for file, (name, (level, rows)) in enumerate(zip(names, files, strict=True)):
 
             def report(what: str, share: float, done: int = file) -> None:
@@ -175,8 +197,8 @@ def write_sog_stream(
 
 
 def _bound(parts: Sequence[Gaussians]) -> dict[str, list[float]]:
-    """The box of the boxes of all Gaussians, of one standard deviation along their axes, as other programs write it, in
-    the digits that float32 has."""
+    """The box of the boxes of all Gaussians, of one standard deviation along their axes, as other
+    programs write it, in the digits that float32 has."""
     scene = joined(parts, 0)
     half = (rotation_matrices(scene.quats).abs() @ scene.stds[..., None])[..., 0]
     limit = torch.finfo(torch.float32).max
@@ -192,10 +214,15 @@ def _meta(path: Path) -> dict[str, Any]:
     meta = json.loads(read_text(path))
     if not isinstance(meta, dict) or meta.get("version", 1) != 1:
         raise SceneError(f"{path}: not a {STREAM_META} of version 1")
-    levels, names = meta["lodLevels"], meta["filenames"]
+    levels = meta["lodLevels"]
+    names = meta["filenames"]
     if not isinstance(levels, int) or isinstance(levels, bool) or not 0 < levels <= 1000:
         raise ValueError(f"{levels!r} levels, expected 1 to 1000")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or len({*names}) != len(names):
+    if (
+        not isinstance(names, list)
+        or not all(isinstance(name, str) for name in names)
+        or len({*names}) != len(names)
+    ):
         raise ValueError("filenames are no list of names that differ")
     return meta
 

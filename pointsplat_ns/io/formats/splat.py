@@ -1,7 +1,7 @@
 """``.splat`` files: 32 bytes a Gaussian and no header, as antimatter15's viewer introduced them.
 
-Position and standard deviations as float32, then colour and opacity, and the quaternion wxyz, as bytes. There are no
-SH beyond the constant coefficient.
+Position and standard deviations as float32, then colour and opacity, and the quaternion wxyz, as
+bytes. There are no SH beyond the constant coefficient.
 """
 
 from __future__ import annotations
@@ -22,26 +22,35 @@ from pointsplat_ns.system.progress import Progress, silent
 
 _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
-HOLDS = Holds(colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)), sh=None, antialiased=False)
+HOLDS = Holds(
+    colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)), sh=None, antialiased=False
+)
 
 
 def read_splat(path: Path | str) -> Gaussians:
-    """Read a ``.splat`` file, as :func:`~pointsplat_ns.io.read_scene` does; the SH degree is 0. Raises SceneError if
-    its size is not a multiple of 32 bytes, it is text, or it does not fit into memory."""
+    """Read a ``.splat`` file, as :func:`~pointsplat_ns.io.read_scene` does; the SH degree is 0.
+    Raises SceneError if its size is not a multiple of 32 bytes, it is text, or it does not fit into
+    memory."""
     path = require_file(path, "a .splat file")
     size = path.stat().st_size
     if size % _ROW.itemsize:
         raise SceneError(f"{path}: {size} bytes; expected {_ROW.itemsize} bytes a Gaussian")
     with path.open("rb") as stream:
         start = stream.read(4096)
-    if start and start.isascii() and start.decode().replace("\n", "").replace("\r", "").replace("\t", "").isprintable():
+    if (
+        start
+        and start.isascii()
+        and start.decode().replace("\n", "").replace("\r", "").replace("\t", "").isprintable()
+    ):
         raise SceneError(f"{path}: text ({start[:24]!r}...); expected the rows of a .splat file")
     require_memory(path, size + size // _ROW.itemsize * 4 * 14)
     with coding.damage_named(path, ".splat"):
         rows = np.fromfile(path, _ROW)
         return coding.scene_of(
             rows["means"],
-            np.log(rows["stds"]),  # of zero -Inf, a flat axis; of a negative size NaN, which is dropped
+            np.log(
+                rows["stds"]
+            ),  # of zero -Inf, a flat axis; of a negative size NaN, which is dropped
             (rows["quats"].astype(np.float32) - 128) / 128,
             coding.logits_of_bytes(rows["rgba"][:, 3]),
             (rows["rgba"][:, :3].astype(np.float32) / 255 - 0.5) / SH_C0,
@@ -50,7 +59,8 @@ def read_splat(path: Path | str) -> Gaussians:
 
 
 def drawing_order(scene: Gaussians) -> Tensor:
-    """Indices (N,): the largest and most opaque Gaussians first, as viewers draw while they load."""
+    """Indices (N,): the largest and most opaque Gaussians first, as viewers draw while they
+    load."""
     weight = scene.scales.double().clamp(-20, 20).sum(dim=1).exp() * scene.alphas
     return weight.argsort(descending=True, stable=True)
 
@@ -58,7 +68,8 @@ def drawing_order(scene: Gaussians) -> Tensor:
 def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
     """The bytes of a ``.splat`` file of a scene, float32 on the CPU, in :func:`drawing_order`.
 
-    SH beyond the constant coefficient have no place in it and are left out. ``progress`` is not called.
+    SH beyond the constant coefficient have no place in it and are left out. ``progress`` is not
+    called.
     """
     scene = scene[drawing_order(scene)]
     rows = np.empty(len(scene), _ROW)

@@ -19,7 +19,14 @@ from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
-from pointsplat_ns.system.processes import by_first, connect_torchrun, gathered, local_rank, rank, torchrun_rank
+from pointsplat_ns.system.processes import (
+    by_first,
+    connect_torchrun,
+    gathered,
+    local_rank,
+    rank,
+    torchrun_rank,
+)
 
 REFINER_RATES = {
     "encoder": 1e-4,
@@ -31,9 +38,10 @@ REFINER_RATES = {
     "features_dc": 1e-4,
     "features_rest": 3e-5,
 }
-"""Adam's peak learning rate for each part of the network. The published 1e-5 to 3e-5 suit a long training of the full
-network. Merged scenes need little repair, and high rates overfit: after 300 steps on two rooms, a third room gained
-0.4 dB at 1e-4 and 0.1 dB at 2e-4, and lost at 3e-4. Scenes pruned by the paper's score learn faster at 1e-3."""
+"""Adam's peak learning rate for each part of the network. The published 1e-5 to 3e-5 suit a long
+training of the full network. Merged scenes need little repair, and high rates overfit: after 300
+steps on two rooms, a third room gained 0.4 dB at 1e-4 and 0.1 dB at 2e-4, and lost at 3e-4. Scenes
+pruned by the paper's score learn faster at 1e-3."""
 
 
 @dataclass
@@ -42,26 +50,30 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
 
     _target: type = field(default_factory=lambda: PointSplatTrainer)
     seconds: float | None = None
-    """Train for this time, in place of max_num_iterations: as many steps as fit, with a schedule that ends with it. The
-    time before the checkpoint of load_dir is part of it."""
+    """Train for this time, in place of max_num_iterations: as many steps as fit, with a schedule
+    that ends with it. The time before the checkpoint of load_dir is part of it."""
     rate_factor: float = 1.0
-    """Multiplies all learning rates. 1 suits merged scenes and few rooms. With ten rooms or more, 3 learns faster and
-    still generalises; so does 10 on scenes pruned by the paper's score."""
+    """Multiplies all learning rates. 1 suits merged scenes and few rooms. With ten rooms or more, 3
+    learns faster and still generalises; so does 10 on scenes pruned by the paper's score."""
     schedule: Literal["cosine", "step"] = "cosine"
     """How the rates fall: along a cosine after a short warm-up, or to a tenth at once."""
     drop_at: float = 0.6
-    """Share of the steps or of the time after which the schedule step has a tenth of the rates (the paper: 0.6)."""
+    """Share of the steps or of the time after which the schedule step has a tenth of the rates (the
+    paper: 0.6)."""
     global_norm: float | None = None
-    """Largest norm of all gradients together, in place of each optimiser's max-norm for its own part."""
+    """Largest norm of all gradients together, in place of each optimiser's max-norm for its own
+    part."""
 
     steps_per_eval_batch: Suppress[Fixed[int]] = 0  # nerfstudio's, without effect here
 
     def set_timestamp(self) -> None:
         """As nerfstudio's; processes that ``torchrun`` started are connected here."""
-        kind, number = self.machine.device_type, self.machine.num_devices
+        kind = self.machine.device_type
+        number = self.machine.num_devices
         if kind != "cuda" and number > 1:
             raise PointSplatError(
-                f"--machine.num-devices {number} is for GPUs; expected 1, or processes on a CPU that are started by "
+                f"--machine.num-devices {number} is for GPUs; expected 1, or processes on a CPU "
+                "that are started by "
                 f"torchrun --nproc-per-node {number} --no-python ns-train {self.method_name}"
             )
         super().set_timestamp()
@@ -73,20 +85,23 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
             super().print_to_terminal()
 
     def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all, and by the first process, whose folder all take."""
+        """As nerfstudio's, but whole or not at all, and by the first process, whose folder all
+        take."""
         by_first(super().save_config)
         self.timestamp = gathered([self.timestamp])[0]
 
     def setup(self, **kwargs) -> Trainer:
         """Build the trainer with a copy of this config whose rates and limits of gradients are set.
 
-        A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes from, or when
-        ``seconds`` are over, as if it had not been stopped.
+        A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes
+        from, or when ``seconds`` are over, as if it had not been stopped.
         """
         for name in ("rate_factor", "drop_at", "seconds", "global_norm"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:  # NaN fails too
-                raise PointSplatError(f"--{name.replace('_', '-')} {value:g}: expected a finite number above 0")
+                raise PointSplatError(
+                    f"--{name.replace('_', '-')} {value:g}: expected a finite number above 0"
+                )
         config = copy.deepcopy(self)
         if config.seconds is not None:
             config.max_num_iterations = sys.maxsize
@@ -102,12 +117,17 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
 
 def adam(rates: dict[str, float], eps: float, max_norm: float | None = None) -> dict[str, dict]:
     """Adam for each part of the network by its rate; the schedules are the trainer's own."""
-    optimizers = {name: FusedAdamConfig(lr=rate, eps=eps, max_norm=max_norm) for name, rate in rates.items()}
-    return {name: {"optimizer": optimizer, "scheduler": None} for name, optimizer in optimizers.items()}
+    optimizers = {
+        name: FusedAdamConfig(lr=rate, eps=eps, max_norm=max_norm) for name, rate in rates.items()
+    }
+    return {
+        name: {"optimizer": optimizer, "scheduler": None} for name, optimizer in optimizers.items()
+    }
 
 
 def pointsplat_config() -> PointSplatTrainerConfig:
-    """The ``pointsplat`` method: 2,000 steps, which take two CPU cores less than an hour on small scenes."""
+    """The ``pointsplat`` method: 2,000 steps, which take two CPU cores less than an hour on small
+    scenes."""
     return PointSplatTrainerConfig(
         method_name=METHOD_NAMES.refiner,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),

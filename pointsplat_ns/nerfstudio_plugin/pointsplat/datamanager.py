@@ -27,16 +27,18 @@ class ScenesDataManagerConfig(DataManagerConfig):
 
     _target: type = field(default_factory=lambda: ScenesDataManager)
     data: Path | None = None
-    """A trained Splatfacto run, a 3DGS .ply, or a folder above several (the newest run of each experiment is taken)."""
+    """A trained Splatfacto run, a 3DGS .ply, or a folder above several (the newest run of each
+    experiment is taken)."""
     scene_data: Path | None = None
-    """Where the photos of the runs are now, if they moved: a folder above those of all runs, or those of the only one.
-    A run whose photos are not found is left out, and named."""
+    """Where the photos of the runs are now, if they moved: a folder above those of all runs, or
+    those of the only one. A run whose photos are not found is left out, and named."""
     supervision: Supervision = "auto"
-    """Training targets for renders of the refined scene. photos: the photos of trained runs. dense: renders of the
-    dense scene from the dataset's poses, or without a dataset from sampled poses. auto: photos for
-    trained runs, dense for PLY files."""
+    """Training targets for renders of the refined scene. photos: the photos of trained runs. dense:
+    renders of the dense scene from the dataset's poses, or without a dataset from sampled poses.
+    auto: photos for trained runs, dense for PLY files."""
     sampled_poses: int = 40
-    """Number of training poses sampled in a scene without a dataset. A fifth of this number is held out in addition."""
+    """Number of training poses sampled in a scene without a dataset. A fifth of this number is held
+    out in addition."""
     sampled_size: tuple[int, int] = (320, 240)
     """Width and height, in pixels, of renders from sampled poses."""
     eval_scenes: tuple[str, ...] = ()
@@ -44,16 +46,17 @@ class ScenesDataManagerConfig(DataManagerConfig):
     images_per_step: int = 2
     """Training photos of one scene rendered at each step (the paper: 2)."""
     cache_gigabytes: float | None = None
-    """Memory for decoded photos, dense and pruned scenes and renders; by default a quarter of the free memory. What
-    does not fit is computed again when needed."""
+    """Memory for decoded photos, dense and pruned scenes and renders; by default a quarter of the
+    free memory. What does not fit is computed again when needed."""
     seed: int = 0
     """Determines the order of scenes and photos."""
 
 
 class ScenesDataManager(DataManager):
-    """Hands out, at each step, one scene and some of its training photos, by the seed and the step alone, so that a
-    resumed training continues as if it had not been stopped. Of W processes, process R takes the places R, W + R,
-    2 W + R... of one sequence: together they see what one process sees in W times the steps."""
+    """Hands out, at each step, one scene and some of its training photos, by the seed and the step
+    alone, so that a resumed training continues as if it had not been stopped. Of W processes,
+    process R takes the places R, W + R, 2 W + R... of one sequence: together they see what one
+    process sees in W times the steps."""
 
     config: ScenesDataManagerConfig
 
@@ -66,15 +69,24 @@ class ScenesDataManager(DataManager):
         local_rank: int = 0,
         **kwargs: Any,
     ):
-        self.config, self.device, self.test_mode = config, device, test_mode
-        self.world_size, self.local_rank = world_size, local_rank
+        self.config = config
+        self.device = device
+        self.test_mode = test_mode
+        self.world_size = world_size
+        self.local_rank = local_rank
         if config.data is None:
-            raise SceneError("--data is missing: expected a trained Splatfacto run, a .ply, or a folder above several")
+            raise SceneError(
+                "--data is missing: expected a trained Splatfacto run, a .ply, or a folder above "
+                "several"
+            )
         if config.images_per_step < 1:
             raise DataError(f"--images-per-step {config.images_per_step}: expected at least 1")
         if config.sampled_poses < 1 or min(config.sampled_size) < 1:
             size = "{} x {}".format(*config.sampled_size)
-            raise DataError(f"{config.sampled_poses} sampled poses of {size} pixels: expected at least 1 of 1 x 1")
+            raise DataError(
+                f"{config.sampled_poses} sampled poses of {size} pixels: expected at least 1 of 1 "
+                "x 1"
+            )
         self._pixels = 0
         self.cache = MemoryCache.of(config.cache_gigabytes)
         self.supervision, self.scenes = self._found_scenes(Path(config.data))
@@ -82,42 +94,66 @@ class ScenesDataManager(DataManager):
         unknown = [name for name in config.eval_scenes if name not in names]
         if unknown:
             raise SceneError(
-                f"--eval-scenes {unknown[0]}: no such scene in {config.data}; there are {', '.join(names)}"
+                f"--eval-scenes {unknown[0]}: no such scene in {config.data}; there are "
+                f"{', '.join(names)}"
             )
         self.train_indices = [i for i, name in enumerate(names) if name not in config.eval_scenes]
-        self.eval_indices = [i for i, name in enumerate(names) if name in config.eval_scenes] or self.train_indices
+        self.eval_indices = [
+            i for i, name in enumerate(names) if name in config.eval_scenes
+        ] or self.train_indices
         if not self.train_indices:
-            raise SceneError(f"--eval-scenes names all {len(names)} scenes of {config.data}; none is left to train on")
+            raise SceneError(
+                f"--eval-scenes names all {len(names)} scenes of {config.data}; none is left to "
+                "train on"
+            )
         self.shown = names.index(shown_scene(names, config.eval_scenes))
         """The scene that the viewer and the exporter get."""
         training = ", ".join(names[i] for i in self.train_indices)
-        held_out = ", ".join(config.eval_scenes) or "no scene (held-out photos of the training scenes serve)"
+        held_out = (
+            ", ".join(config.eval_scenes)
+            or "no scene (held-out photos of the training scenes serve)"
+        )
         targets = "photos" if self.supervision == "photos" else "renders of the dense scenes"
-        CONSOLE.log(f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}")
+        CONSOLE.log(
+            f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}"
+        )
         super().__init__()
 
     def _found_scenes(self, folder: Path) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
-        """The kind of training targets, and the scenes that ``--data`` names. Raises SceneError if there is none, or
-        photos are needed and those of no run are found; DataError if a training fitted colours to each photo."""
+        """The kind of training targets, and the scenes that ``--data`` names. Raises SceneError if
+        there is none, or photos are needed and those of no run are found; DataError if a training
+        fitted colours to each photo."""
         config = self.config
         runs, plys, nothing = find_runs_and_plys(folder, config.supervision)
         if not runs and not plys:
             if nothing is None:
-                found = "a PLY file, which has no photos" if config.supervision == "photos" else "no Gaussians in it"
+                found = (
+                    "a PLY file, which has no photos"
+                    if config.supervision == "photos"
+                    else "no Gaussians in it"
+                )
                 found = found if folder.is_file() else "no such file"
-                wanted = "--pipeline.datamanager.supervision dense" if config.supervision == "photos" else "a 3DGS .ply"
+                wanted = (
+                    "--pipeline.datamanager.supervision dense"
+                    if config.supervision == "photos"
+                    else "a 3DGS .ply"
+                )
                 raise SceneError(f"{folder}: {found}; expected {wanted}")
             hint = " (PLY files are trained on with --pipeline.datamanager.supervision dense)"
             hint = hint if config.supervision == "photos" else ", or 3DGS PLY files"
             raise SceneError(f"{nothing}{hint}") from nothing
-        chosen: Literal["photos", "dense"] = "dense" if plys or config.supervision == "dense" else "photos"
+        chosen: Literal["photos", "dense"] = (
+            "dense" if plys or config.supervision == "dense" else "photos"
+        )
         scenes: list[DenseScene] = []
         missing: list[str] = []
         for name, run in runs.items():
             has_photos = True
             if self.test_mode != "inference":
                 try:
-                    run = dataclasses.replace(run, data=open_run(run.config_path, data=config.scene_data).data)
+                    run = dataclasses.replace(
+                        run, data=open_run(run.config_path, data=config.scene_data).data
+                    )
                 except SceneError:
                     has_photos = False
                     missing.append(f"{run.config_path}: its data {run.data} is not there")
@@ -128,11 +164,14 @@ class ScenesDataManager(DataManager):
                 scene.need_photos_as_rendered("take --pipeline.datamanager.supervision dense")
             if has_photos or chosen == "dense":
                 scenes.append(scene)
-        scenes += [DenseScene(name, path, self.cache, config, self.device) for name, path in plys.items()]
+        scenes += [
+            DenseScene(name, path, self.cache, config, self.device) for name, path in plys.items()
+        ]
         if not scenes:
             others = f", and that of {len(missing) - 1} more runs" if missing[1:] else ""
             raise SceneError(
-                f"{missing[0]}{others}; name the folder where it is now (--pipeline.datamanager.scene-data DIR), or "
+                f"{missing[0]}{others}; name the folder where it is now "
+                "(--pipeline.datamanager.scene-data DIR), or "
                 "take --pipeline.datamanager.supervision dense"
             )
         return chosen, scenes
@@ -145,7 +184,11 @@ class ScenesDataManager(DataManager):
     @property
     def eval_dataset(self) -> InputDataset | None:  # type: ignore[override]
         """Held-out photos of the shown scene, for the viewer."""
-        return None if self.test_mode == "inference" else self.scenes[self.shown].frames("test").dataset
+        return (
+            None
+            if self.test_mode == "inference"
+            else self.scenes[self.shown].frames("test").dataset
+        )
 
     def setup_train(self) -> None:
         """Nothing: photos are read when they are needed."""
@@ -164,16 +207,20 @@ class ScenesDataManager(DataManager):
     def scene_at(self, step: int) -> int:
         """Index of the scene of a step. Each scene comes once before any is repeated."""
         epoch, place = divmod(self.place(step), len(self.train_indices))
-        order = random.Random(f"{self.config.seed} scenes {epoch}").sample(self.train_indices, len(self.train_indices))
+        order = random.Random(f"{self.config.seed} scenes {epoch}").sample(
+            self.train_indices, len(self.train_indices)
+        )
         return order[place]
 
     def next_train(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
-        """Index of a training scene, and some of its training photos with their cameras, on this process's device:
-        random ones, none of them twice."""
+        """Index of a training scene, and some of its training photos with their cameras, on this
+        process's device: random ones, none of them twice."""
         scene = self.scene_at(step)
         targets = self.training_frames(scene)
         generator = random.Random(f"{self.config.seed} photos {self.place(step)}")
-        chosen = generator.sample(range(len(targets)), min(self.config.images_per_step, len(targets)))
+        chosen = generator.sample(
+            range(len(targets)), min(self.config.images_per_step, len(targets))
+        )
         frames = [targets[i] for i in chosen]
         self._pixels = sum(int(camera.height) * int(camera.width) for camera, _ in frames)
         return scene, frames

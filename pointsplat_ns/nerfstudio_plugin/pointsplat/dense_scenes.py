@@ -1,4 +1,5 @@
-"""Dense scenes whose own renders, from sampled poses or those of a dataset, take the place of photos."""
+"""Dense scenes whose own renders, from sampled poses or those of a dataset, take the place of
+photos."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ Split = Literal["train", "test"]
 
 
 class DenseScene:
-    """A dense scene: its Gaussians, read from a 3DGS PLY when they are needed, and its own renders from sampled poses.
+    """A dense scene: its Gaussians, read from a 3DGS PLY when they are needed, and its own renders
+    from sampled poses.
 
     Args:
         name: unique among the scenes in use.
@@ -55,19 +57,25 @@ class DenseScene:
         poses: ScenesDataManagerConfig | None = None,
         device: torch.device | str = "cpu",
     ):
-        self.name, self.source, self.cache = name, source, cache
-        self._poses, self.device = poses, device
+        self.name = name
+        self.source = source
+        self.cache = cache
+        self._poses = poses
+        self.device = device
         self.rendered: dict[Split, Frames] = {
             "train": Frames(RenderedDataset(self, "train"), "uint8", cache, device),
             "test": Frames(RenderedDataset(self, "test"), "float32", cache, device),
         }
-        """Renders of the dense scene, in 8 bits as photos are from training poses, not rounded from held-out ones."""
+        """Renders of the dense scene, in 8 bits as photos are from training poses, not rounded from
+        held-out ones."""
 
     @cached_property
     def identity(self) -> str:
-        """Text by which a checkpoint records that the network was trained on this scene: the name, and a fingerprint of
-        the file's size and of the bytes at both ends. It stays the same if the folder is moved."""
-        size, read = self.source.stat().st_size, 1 << 16
+        """Text by which a checkpoint records that the network was trained on this scene: the name,
+        and a fingerprint of the file's size and of the bytes at both ends. It stays the same if the
+        folder is moved."""
+        size = self.source.stat().st_size
+        read = 1 << 16
         with self.source.open("rb") as stream:
             content = stream.read(read)
             stream.seek(max(0, size - read))
@@ -84,7 +92,8 @@ class DenseScene:
         return read_scene(self.source)
 
     def dense(self, keep: bool) -> Gaussians:
-        """The Gaussians, from the cache or the file. ``keep`` puts them into the cache if there is room."""
+        """The Gaussians, from the cache or the file. ``keep`` puts them into the cache if there is
+        room."""
         key = "dense", self.name
         dense = self.cache.get(key)
         if dense is None:
@@ -94,14 +103,21 @@ class DenseScene:
         return dense
 
     def cameras(self, split: Split) -> Cameras:
-        """Pinhole cameras (C,) sampled, different ones for each split: a fifth as many are held out. Every second one
-        of the training split is subsampled from a picture of the size that people look at. Raises DataError, which
-        names the file, if nothing of the scene is visible."""
+        """Pinhole cameras (C,) sampled, different ones for each split: a fifth as many are held
+        out. Every second one of the training split is subsampled from a picture of the size that
+        people look at. Raises DataError, which names the file, if nothing of the scene is
+        visible."""
         assert self._poses is not None
-        size, count = self._poses.sampled_size, self._poses.sampled_poses
+        size = self._poses.sampled_size
+        count = self._poses.sampled_poses
         seed = random.Random(f"{self._poses.seed} poses {split}").getrandbits(31)
         try:
-            views = sample_views(self.dense(keep=True), count if split == "train" else max(1, count // 5), *size, seed)
+            views = sample_views(
+                self.dense(keep=True),
+                count if split == "train" else max(1, count // 5),
+                *size,
+                seed,
+            )
         except DataError as error:
             raise DataError(f"{self.source}: {error}") from error
         cameras = cameras_of_views(views)
@@ -115,11 +131,12 @@ class DenseScene:
 
 
 class RenderedDataset:
-    """Renders of a dense scene from the cameras of a split, with the part of a dataset's interface that nerfstudio's
-    viewer uses."""
+    """Renders of a dense scene from the cameras of a split, with the part of a dataset's interface
+    that nerfstudio's viewer uses."""
 
     def __init__(self, scene: DenseScene, split: Split):
-        self._scene, self._split = scene, split
+        self._scene = scene
+        self._split = split
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -133,10 +150,15 @@ class RenderedDataset:
         return len(self.cameras)
 
     @torch.no_grad()
-    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """An exact render (H, W, 3) on the CPU, integers in [0, 255] or floats in [0, 1], and its index."""
+    def get_data(
+        self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32"
+    ) -> dict[str, Any]:
+        """An exact render (H, W, 3) on the CPU, integers in [0, 255] or floats in [0, 1], and its
+        index."""
         scene = self._scene
-        views = views_of_cameras(self.cameras[image_idx : image_idx + 1], scene.background, scene.rasterize_mode)
+        views = views_of_cameras(
+            self.cameras[image_idx : image_idx + 1], scene.background, scene.rasterize_mode
+        )
         image = render(scene.dense(keep=True).to(scene.device), views[0]).cpu()
         return {
             "image": (255 * image).round().to(torch.uint8) if image_type == "uint8" else image,

@@ -30,11 +30,18 @@ METRICS = ("psnr", "ssim", "lpips")
 
 VARIANTS = ("dense", "pruned", "refined")
 
-PHOTOS, RENDERS = "photos", "dense renders"
+PHOTOS = "photos"
+RENDERS = "dense renders"
 """What renders are compared with."""
 
-COLUMNS = (("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3), ("gaussians", "Gaussians", 0),
-           ("megabytes", "MB", 2), ("fps", "fps", 1))  # fmt: skip
+COLUMNS = (
+    ("psnr", "PSNR dB", 2),
+    ("ssim", "SSIM", 3),
+    ("lpips", "LPIPS", 3),
+    ("gaussians", "Gaussians", 0),
+    ("megabytes", "MB", 2),
+    ("fps", "fps", 1),
+)
 """Columns of the printed table: a value of each variant, the title, digits to show."""
 
 
@@ -47,7 +54,8 @@ class SceneReport:
     """What renders were compared with: :data:`PHOTOS` or :data:`RENDERS`."""
     views: int
     variants: dict[str, dict[str, Any]]
-    """By variant: psnr (dB), ssim, lpips (None if it cannot be computed), gaussians, megabytes, fps."""
+    """By variant: psnr (dB), ssim, lpips (None if it cannot be computed), gaussians, megabytes,
+    fps."""
     per_view: dict[str, dict[str, list[float]]]
     """By variant and metric: one value per photo."""
     last_picture: Tensor | None
@@ -65,19 +73,22 @@ def evaluate_scene(
     picture_folder: Path | None = None,
     progress: bool = False,
 ) -> SceneReport:
-    """Render each variant, on the model's device, from each photo's camera of shape (1,), and compare the render with
-    the photo. The model must be in evaluation mode. If LPIPS fails for one view, the scene has none. Images of all
-    views go to ``picture_folder``, if it is given. Raises DataError if there is no photo."""
+    """Render each variant, on the model's device, from each photo's camera of shape (1,), and
+    compare the render with the photo. The model must be in evaluation mode. If LPIPS fails for one
+    view, the scene has none. Images of all views go to ``picture_folder``, if it is given. Raises
+    DataError if there is no photo."""
     values: dict[str, dict[str, list[float]]] = {v: {m: [] for m in METRICS} for v in variants}
     seconds: dict[str, list[float]] = {v: [] for v in variants}
-    picture, views = None, 0
+    picture = None
+    views = 0
     for camera, data in tracked(frames, f"evaluating {scene.name}", len(frames), progress):
         pictures: list[Tensor] = []
         for name, gaussians in variants.items():
             start = now(model.device)
             outputs = model.draw(gaussians, scene, camera)
             seconds[name].append(now(model.device) - start)
-            photo, rgb = model.photo_of(data, outputs["background"]), outputs["rgb"]
+            photo = model.photo_of(data, outputs["background"])
+            rgb = outputs["rgb"]
             pictures = [*(pictures or [photo]), rgb]
             for metric, measure in (("psnr", psnr), ("ssim", ssim), ("lpips", lpips)):
                 value = measure(rgb, photo)
@@ -88,8 +99,8 @@ def evaluate_scene(
         views += 1
     if views == 0:
         raise DataError(
-            f"{scene.source}: no frame of its data is held out, so there is nothing to evaluate on; change the "
-            "dataparser's split"
+            f"{scene.source}: no frame of its data is held out, so there is nothing to evaluate "
+            "on; change the dataparser's split"
         )
     if any(len(per_view["lpips"]) < views for per_view in values.values()):
         for per_view in values.values():  # a mean over fewer views would not be comparable
@@ -100,12 +111,15 @@ def evaluate_scene(
         | {"fps": _finite(1.0 / statistics.median(seconds[name]))}
         for name, gaussians in variants.items()
     }
-    return SceneReport(scene.name, PHOTOS if scene.has_photos else RENDERS, views, rows, values, picture)
+    return SceneReport(
+        scene.name, PHOTOS if scene.has_photos else RENDERS, views, rows, values, picture
+    )
 
 
 def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
-    """The results that ``ns-eval`` writes as JSON, with None for values that are not finite or not computed. Means are
-    over the scenes that are compared with photos, or over all where there is none."""
+    """The results that ``ns-eval`` writes as JSON, with None for values that are not finite or not
+    computed. Means are over the scenes that are compared with photos, or over all where there is
+    none."""
     judged = [report for report in reports if report.reference == PHOTOS] or reports
     unseen = [report for report in judged if not report.seen_in_training]
     seen = [report for report in judged if report.seen_in_training]
@@ -113,11 +127,16 @@ def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
     for metric in METRICS:
         summary[metric] = _mean([report.variants["refined"][metric] for report in unseen or judged])
         if with_std:
-            per_view = [value for report in unseen or judged for value in report.per_view["refined"][metric]]
-            summary[f"{metric}_std"] = _finite(statistics.stdev(per_view)) if len(per_view) > 1 else None
+            per_view = [
+                value for report in unseen or judged for value in report.per_view["refined"][metric]
+            ]
+            summary[f"{metric}_std"] = (
+                _finite(statistics.stdev(per_view)) if len(per_view) > 1 else None
+            )
     summary["average"] = _average(judged)
     if unseen and seen:
-        summary["average_unseen"], summary["average_seen"] = _average(unseen), _average(seen)
+        summary["average_unseen"] = _average(unseen)
+        summary["average_seen"] = _average(seen)
     summary["reference"] = judged[0].reference
     summary["scenes"] = {
         report.name: {
@@ -134,8 +153,12 @@ def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
 def print_summary(summary: dict[str, Any]) -> None:
     """Print the results of ``ns-eval``: a table, and the reason if LPIPS is missing."""
     settings = summary["settings"]
-    scenes, reference = summary["scenes"], summary["reference"]
-    blocks = [(name, "yes" if scene["seen_in_training"] else "never", scene) for name, scene in scenes.items()]
+    scenes = summary["scenes"]
+    reference = summary["reference"]
+    blocks = [
+        (name, "yes" if scene["seen_in_training"] else "never", scene)
+        for name, scene in scenes.items()
+    ]
     if len(blocks) > 1:
         means = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
         blocks += [("average", seen, summary[key]) for seen, key in means if key in summary]
@@ -143,14 +166,23 @@ def print_summary(summary: dict[str, Any]) -> None:
         (
             *((name, seen) if variant == VARIANTS[0] else ("", "")),
             variant,
-            *("-" if (value := scene[variant][key]) is None else f"{value:,.{digits}f}" for key, _, digits in COLUMNS),
+            *(
+                "-" if (value := scene[variant][key]) is None else f"{value:,.{digits}f}"
+                for key, _, digits in COLUMNS
+            ),
         )
         for name, seen, scene in blocks
         for variant in VARIANTS
     ]
     header = ("scene", "seen in training", "variant", *(title for _, title, _ in COLUMNS))
     made = f"keep {settings['keep']}, by {settings['by']}, refiner {settings['size']}"
-    print_table(header, rows, title=f"{made}; compared with {reference}", left=(0, 1, 2), section=len(VARIANTS))
+    print_table(
+        header,
+        rows,
+        title=f"{made}; compared with {reference}",
+        left=(0, 1, 2),
+        section=len(VARIANTS),
+    )
     others = [name for name, scene in scenes.items() if scene["reference"] != reference]
     if others:
         print(f"compared with {RENDERS}, and in no mean: {', '.join(others)}")
@@ -171,7 +203,8 @@ def _average(reports: list[SceneReport]) -> dict[str, dict[str, float | None]]:
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """Mean of the values; None if there are none, one of them is None, or the mean is not finite."""
+    """Mean of the values; None if there are none, one of them is None, or the mean is not
+    finite."""
     numbers = [v for v in values if v is not None]
     return _finite(sum(numbers) / len(numbers)) if numbers and len(numbers) == len(values) else None
 

@@ -1,6 +1,7 @@
 """The PointSplat model: a dense scene is pruned once, refined by one network, and rendered.
 
-To nerfstudio's viewer and exporter it is a Splatfacto model, whose Gaussians are the refined ones of one scene.
+To nerfstudio's viewer and exporter it is a Splatfacto model, whose Gaussians are the refined ones
+of one scene.
 """
 
 from __future__ import annotations
@@ -42,57 +43,66 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     keep: float = 0.3
     """Gaussians to keep: a ratio in (0, 1], or a count if above 1."""
     more_keeps: tuple[float, ...] = ()
-    """Further values of keep. Each training step draws one of all values at random, so that one network learns to
-    repair scenes of several budgets. Evaluation uses keep."""
+    """Further values of keep. Each training step draws one of all values at random, so that one
+    network learns to repair scenes of several budgets. Evaluation uses keep."""
     augment: bool = False
-    """Rotate, mirror and recolour each training scene at random, so that the network learns neither the up direction
-    nor the colours of the training scenes. The target images do not change. A scene's neighbour tables are then
-    computed anew at each step."""
+    """Rotate, mirror and recolour each training scene at random, so that the network learns neither
+    the up direction nor the colours of the training scenes. The target images do not change. A
+    scene's neighbour tables are then computed anew at each step."""
     by: str = "merge"
-    """Pruning method. merge replaces neighbours by one Gaussian each. The others keep the Gaussians with the highest
-    score: coverage, paper (eq. 3), authors, opacity or random."""
+    """Pruning method. merge replaces neighbours by one Gaussian each. The others keep the Gaussians
+    with the highest score: coverage, paper (eq. 3), authors, opacity or random."""
     opacity_weight: float | None = None
-    """Lambda of paper and authors: the weight of opacity against volume; by default the paper's 0.3."""
+    """Lambda of paper and authors: the weight of opacity against volume; by default the paper's
+    0.3."""
     size: Literal["tiny", "small", "full"] = "small"
     """Size of the network: full is the paper's and needs a GPU; small and tiny are for a CPU."""
     encoder: Literal["dual", "concat"] = "dual"
-    """dual is the paper's dual-branch encoder; concat feeds one concatenated vector, as SplatFormer does."""
+    """dual is the paper's dual-branch encoder; concat feeds one concatenated vector, as SplatFormer
+    does."""
     use_appearance: bool = True
-    """Gate the geometry branch by the appearance branch (the paper's Table 4); dual encoder only."""
+    """Gate the geometry branch by the appearance branch (the paper's Table 4); dual encoder
+    only."""
     use_position: bool = True
     """Add the positional term delta to both branches (the paper's Table 4); dual encoder only."""
     norm: Literal["scene", "batch"] = "scene"
-    """Normalisation outside the attention blocks. scene: statistics of the current scene, also in evaluation. batch:
-    the published one, with running averages over the training scenes in evaluation."""
+    """Normalisation outside the attention blocks. scene: statistics of the current scene, also in
+    evaluation. batch: the published one, with running averages over the training scenes in
+    evaluation."""
     enc_depths: tuple[int, ...] | None = None
     """Blocks in each stage of the backbone's encoder; by default those of size."""
     stem: Literal["conv", "linear"] = "conv"
-    """First layer of the backbone: a convolution over neighbours, or a linear layer (the authors' code)."""
+    """First layer of the backbone: a convolution over neighbours, or a linear layer (the authors'
+    code)."""
     raw_inputs: bool = False
-    """Give the network log-scales and opacity logits as they are, not brought to order 1. With the encoder concat this
-    is the imbalance of features that the paper speaks of."""
+    """Give the network log-scales and opacity logits as they are, not brought to order 1. With the
+    encoder concat this is the imbalance of features that the paper speaks of."""
     means_reach: float = 0.05
-    """Largest move of a mean along an axis, as a share of the scene's extent (the authors' code: 1)."""
+    """Largest move of a mean along an axis, as a share of the scene's extent (the authors' code:
+    1)."""
     train_encoder: bool = True
     """Train the encoder. The authors' code leaves it at its random weights."""
     pixel_loss: PixelLoss = "l1"
-    """Pixel loss: mean absolute difference, or root mean squared difference, which determines the PSNR."""
+    """Pixel loss: mean absolute difference, or root mean squared difference, which determines the
+    PSNR."""
     lpips_weight: float = 0.1
     """Weight of LPIPS in the loss; the pixel loss has weight 1."""
     lpips_net: Literal["auto", "alex", "vgg"] = "auto"
-    """Network of LPIPS in the training loss. auto is vgg on CUDA, and elsewhere alex, which is thirty times cheaper."""
+    """Network of LPIPS in the training loss. auto is vgg on CUDA, and elsewhere alex, which is
+    thirty times cheaper."""
 
     sh_degree: ClassVar[int] = 3
     """Read by ``ns-export``: above 0, colours are SH coefficients. A scene may have any degree."""
 
     def prune_settings(self, keep: float | None = None) -> PruneSettings:
-        """How scenes are pruned; ``keep`` is the config's own by default. Raises PointSplatError if the settings fit no
-        scene."""
+        """How scenes are pruned; ``keep`` is the config's own by default. Raises PointSplatError if
+        the settings fit no scene."""
         return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
 
 
 class PrunedScene(NamedTuple):
-    """A pruned scene, on the device of the network, and its neighbour tables, None if it is empty."""
+    """A pruned scene, on the device of the network, and its neighbour tables, None if it is
+    empty."""
 
     pruned: Gaussians
     structure: Structure | None
@@ -110,28 +120,33 @@ class PointSplatModel(SplatfactoModel):
             config.prune_settings(keep)
         if not 0 <= config.lpips_weight < math.inf:  # NaN fails too
             raise PointSplatError(
-                f"--pipeline.model.lpips-weight {config.lpips_weight:g}: expected a finite number, 0 or above"
+                f"--pipeline.model.lpips-weight {config.lpips_weight:g}: expected a finite "
+                "number, 0 or above"
             )
         self.refiner = Refiner(preset(config.size, **network_options(vars(config))))
         self.refiner.encoder.requires_grad_(config.train_encoder)
         self.crop_box: OrientedBox | None = None
         manager: ScenesDataManager = self.kwargs["datamanager"]
-        self.scenes, self.shown, self._cache = manager.scenes, manager.shown, manager.cache
+        self.scenes = manager.scenes
+        self.shown = manager.shown
+        self._cache = manager.cache
         self.no_lpips_reason: str | None = None
         """Why LPIPS is left out of the loss; None while it is part of it."""
         self._refined: tuple[int, Gaussians] | None = None
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
-        """Load the network's weights. Raises SceneError if they are those of another network; nerfstudio would load the
-        part that fits."""
+        """Load the network's weights. Raises SceneError if they are those of another network;
+        nerfstudio would load the part that fits."""
         self._refined = None
         try:
             return torch.nn.Module.load_state_dict(self, dict, **{**kwargs, "strict": True})
         except RuntimeError as error:
-            options = ", ".join(f"{name} {value}" for name, value in network_options(vars(self.config)).items())
+            options = ", ".join(
+                f"{name} {value}" for name, value in network_options(vars(self.config)).items()
+            )
             raise SceneError(
-                f"the checkpoint does not hold a network of size {self.config.size} with {options}; expected the "
-                "settings that it was trained with"
+                f"the checkpoint does not hold a network of size {self.config.size} with "
+                f"{options}; expected the settings that it was trained with"
             ) from error
 
     def get_training_callbacks(self, training_callback_attributes) -> list:
@@ -139,15 +154,23 @@ class PointSplatModel(SplatfactoModel):
         return []
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
-        """The network's parameters that are trained, by part: encoder, backbone and one head per attribute."""
+        """The network's parameters that are trained, by part: encoder, backbone and one head per
+        attribute."""
         groups = self.refiner.parameter_groups()
-        return {name: parts for name, parts in groups.items() if name != "encoder" or self.config.train_encoder}
+        return {
+            name: parts
+            for name, parts in groups.items()
+            if name != "encoder" or self.config.train_encoder
+        }
 
-    def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
-        """A pruned scene by its index, from memory if it was pruned before. ``dense`` are its Gaussians, if they have
-        been read; ``keep`` is by default the config's. Raises a PointSplatError that names the scene if the settings do
-        not fit it."""
-        scene, settings = self.scenes[index], self.config.prune_settings(keep)
+    def pruned_scene(
+        self, index: int, dense: Gaussians | None = None, keep: float | None = None
+    ) -> PrunedScene:
+        """A pruned scene by its index, from memory if it was pruned before. ``dense`` are its
+        Gaussians, if they have been read; ``keep`` is by default the config's. Raises a
+        PointSplatError that names the scene if the settings do not fit it."""
+        scene = self.scenes[index]
+        settings = self.config.prune_settings(keep)
         key = "pruned", scene.name, settings
         found = self._cache.get(key)
         if found is None:
@@ -181,9 +204,11 @@ class PointSplatModel(SplatfactoModel):
         return self._refined[1]
 
     def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
-        """Render Gaussians as a scene is drawn, from a camera of shape (1,): ``rgb`` (H, W, 3) in [0, 1],
-        ``accumulation`` (H, W, 1), ``background`` (H, W, 3), and in evaluation ``depth`` (H, W, 1) in scene units."""
-        width, height = int(camera.width.item()), int(camera.height.item())
+        """Render Gaussians as a scene is drawn, from a camera of shape (1,): ``rgb`` (H, W, 3) in
+        [0, 1], ``accumulation`` (H, W, 1), ``background`` (H, W, 3), and in evaluation ``depth``
+        (H, W, 1) in scene units."""
+        width = int(camera.width.item())
+        height = int(camera.height.item())
         image, alpha, _ = self.config.rasterize(
             training=self.training,
             means=gaussians.means,
@@ -212,40 +237,58 @@ class PointSplatModel(SplatfactoModel):
         return outputs
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # type: ignore[override]  # models of rays take those
-        """The shown scene, refined, from one camera; inside the viewer's crop box if there is one."""
+        """The shown scene, refined, from one camera; inside the viewer's crop box if there is
+        one."""
         need_pinhole(camera)
         gaussians = self.gaussians
         if self.crop_box is not None and not self.training:
             gaussians = gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
         return self.draw(gaussians, self.scenes[self.shown], camera)
 
-    def losses(self, index: int, frames: list[tuple[Cameras, dict]]) -> tuple[dict, dict[str, Tensor], dict]:
-        """Refine a scene, by its index, and compare its renders with photos from their cameras of shape (1,): outputs
-        of the last photo's camera; the pixel loss and the weighted LPIPS, averaged over the photos; and metrics to log.
-        Once LPIPS could not be computed it stays left out, so that the loss does not change back."""
-        config, refined, scene = self.config, self.refine(index), self.scenes[index]
+    def losses(
+        self, index: int, frames: list[tuple[Cameras, dict]]
+    ) -> tuple[dict, dict[str, Tensor], dict]:
+        """Refine a scene, by its index, and compare its renders with photos from their cameras of
+        shape (1,): outputs of the last photo's camera; the pixel loss and the weighted LPIPS,
+        averaged over the photos; and metrics to log. Once LPIPS could not be computed it stays left
+        out, so that the loss does not change back."""
+        config = self.config
+        refined = self.refine(index)
+        scene = self.scenes[index]
         outputs: dict[str, Tensor] = {}
         pairs = []
         for camera, data in frames:
             outputs = self.draw(refined, scene, camera)
             mask = data.get("mask", 1)
             pairs.append((outputs["rgb"] * mask, self.photo_of(data, outputs["background"]) * mask))
-        pixel_loss = torch.stack([PIXEL_LOSSES[config.pixel_loss](render - photo) for render, photo in pairs]).mean()
+        pixel_loss = torch.stack(
+            [PIXEL_LOSSES[config.pixel_loss](render - photo) for render, photo in pairs]
+        ).mean()
         losses: dict[str, Tensor] = {config.pixel_loss: pixel_loss}
         if config.lpips_weight > 0 and self.no_lpips_reason is None:
             cheap: Literal["alex", "vgg"] = "vgg" if self.device.type == "cuda" else "alex"
             try:
-                lpips = cached_lpips(cheap if config.lpips_net == "auto" else config.lpips_net, pairs[0][0].device)
-                losses["lpips"] = config.lpips_weight * torch.stack([lpips(*pair) for pair in pairs]).mean()
-            except (LpipsUnavailable, ImageError) as error:  # no weights, or a picture too small for the network
+                lpips = cached_lpips(
+                    cheap if config.lpips_net == "auto" else config.lpips_net, pairs[0][0].device
+                )
+                losses["lpips"] = (
+                    config.lpips_weight * torch.stack([lpips(*pair) for pair in pairs]).mean()
+                )
+            except (
+                LpipsUnavailable,
+                ImageError,
+            ) as error:  # no weights, or a picture too small for the network
                 self.no_lpips_reason = str(error)
                 CONSOLE.log(f"going on without LPIPS in the loss: {error}")
         quality = torch.stack([psnr(render.detach(), photo) for render, photo in pairs]).mean()
         return outputs, losses, {"psnr": quality, "gaussian_count": len(refined)}
 
     def photo_of(self, data: dict[str, Any], background: Tensor) -> Tensor:
-        """A photo (H, W, 3) in [0, 1], composited over ``background`` if it has an alpha channel."""
-        return self.composite_with_background(in_unit_range(data["image"]).to(self.device), background)
+        """A photo (H, W, 3) in [0, 1], composited over ``background`` if it has an alpha
+        channel."""
+        return self.composite_with_background(
+            in_unit_range(data["image"]).to(self.device), background
+        )
 
     @property
     def gaussians(self) -> Gaussians:
@@ -259,5 +302,6 @@ class PointSplatModel(SplatfactoModel):
 
     @property
     def gauss_params(self) -> dict[str, Tensor]:  # type: ignore[override]
-        """The shown scene's parameters by Splatfacto's names, for nerfstudio's viewer and exporter."""
+        """The shown scene's parameters by Splatfacto's names, for nerfstudio's viewer and
+        exporter."""
         return dict(self.gaussians.items())

@@ -1,4 +1,5 @@
-"""The PointSplat pipeline: training over many scenes, and an evaluation of dense, pruned and refined scenes."""
+"""The PointSplat pipeline: training over many scenes, and an evaluation of dense, pruned and
+refined scenes."""
 
 from __future__ import annotations
 
@@ -9,7 +10,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.engine.callbacks import (
+    TrainingCallback,
+    TrainingCallbackAttributes,
+    TrainingCallbackLocation,
+)
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -18,16 +23,27 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat import evaluation
-from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager, ScenesDataManagerConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import (
+    ScenesDataManager,
+    ScenesDataManagerConfig,
+)
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import evaluate_scene, only_finite
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
 
 MODEL_METADATA = (
-    "size", "by", "keep", "more_keeps", "opacity_weight", "norm", "train_encoder", "pixel_loss", "lpips_weight",
+    "size",
+    "by",
+    "keep",
+    "more_keeps",
+    "opacity_weight",
+    "norm",
+    "train_encoder",
+    "pixel_loss",
+    "lpips_weight",
     "lpips_net",
-)  # fmt: skip
+)
 """Settings of the model in the metadata of a saved network."""
 
 
@@ -58,27 +74,33 @@ class PointSplatPipeline(VanillaPipeline):
         super(VanillaPipeline, self).__init__()
         if world_size != processes.world_size():
             raise SceneError(
-                f"{world_size} processes are asked for and {processes.world_size()} are connected; start them with "
-                "torchrun, or, on GPUs, by ns-train --machine.num-devices"
+                f"{world_size} processes are asked for and {processes.world_size()} are connected; "
+                "start them with torchrun, or, on GPUs, by ns-train --machine.num-devices"
             )
         if world_size > 1 and config.model.norm == "batch":
             raise SceneError(
-                "--pipeline.model.norm batch: its statistics are of the scenes of one process; expected scene where "
-                "several processes train together"
+                "--pipeline.model.norm batch: its statistics are of the scenes of one process; "
+                "expected scene where several processes train together"
             )
         if world_size > 1 and torch.device(device).type == "cuda":
             torch.cuda.set_device(local_rank)  # nccl gathers objects through the current device
-        self.config, self.test_mode, self.world_size = config, test_mode, world_size
+        self.config = config
+        self.test_mode = test_mode
+        self.world_size = world_size
         self.datamanager = config.datamanager.setup(
             device=device, test_mode=test_mode, world_size=world_size, local_rank=processes.rank()
         )
         torch.manual_seed(config.datamanager.seed)
-        self._model = config.model.setup(scene_box=None, num_train_data=0, device=device, datamanager=self.datamanager)
+        self._model = config.model.setup(
+            scene_box=None, num_train_data=0, device=device, datamanager=self.datamanager
+        )
         self.model.to(device)
         processes.share_state(self.model.refiner)
-        scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
+        scenes = self.datamanager.scenes
+        indices = self.datamanager.train_indices
         self.trained_on = {scenes[i].identity for i in indices} if test_mode == "val" else set()
-        """Identities of the scenes that the network has been trained on, also before it was resumed."""
+        """Identities of the scenes that the network has been trained on, also before it was
+        resumed."""
         self.seconds = 0.0
         """Duration of the training so far, also before it was resumed."""
 
@@ -92,18 +114,25 @@ class PointSplatPipeline(VanillaPipeline):
         self.trained_on |= set(state["trained_on"])
         gone = set(state["trained_on"]) - {scene.identity for scene in self.datamanager.scenes}
         if gone:
-            CONSOLE.log(f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} no longer has")
+            CONSOLE.log(
+                f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} "
+                "no longer has"
+            )
 
     @property
     def model(self) -> PointSplatModel:
-        """The model, which is not wrapped for distributed training: the trainer averages gradients."""
+        """The model, which is not wrapped for distributed training: the trainer averages
+        gradients."""
         return self._model  # type: ignore[return-value]
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
-        """Outputs of the last photo's camera, losses and metrics of one scene at some of its training photos. Random
-        numbers depend only on the seed and on the scene's place in the sequence, so that a training can be resumed."""
+        """Outputs of the last photo's camera, losses and metrics of one scene at some of its
+        training photos. Random numbers depend only on the seed and on the scene's place in the
+        sequence, so that a training can be resumed."""
         place = self.datamanager.place(step)
-        torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
+        torch.manual_seed(
+            random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63)
+        )
         index, frames = self.datamanager.next_train(step)
         outputs, losses, metrics = self.model.losses(index, frames)
         return outputs, losses, metrics | {"scene": index}
@@ -114,7 +143,10 @@ class PointSplatPipeline(VanillaPipeline):
         training = self.training
         self.eval()
         index, frames = self.datamanager.next_eval_image(step)
-        variants = {"pruned": self.model.pruned_scene(index).pruned, "refined": self.model.refine(index)}
+        variants = {
+            "pruned": self.model.pruned_scene(index).pruned,
+            "refined": self.model.refine(index),
+        }
         scene = self.datamanager.scenes[index]
         report = evaluate_scene(self.model, scene, variants, frames, ReportedLpips())
         pixels = int(frames[0][0].height) * int(frames[0][0].width)
@@ -128,19 +160,27 @@ class PointSplatPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """The summary of all held-out photos of all scenes, and ``lpips_note`` if LPIPS is missing. Images of photo and
-        variants side by side go to ``output_path``. Given a ``step``, by the trainer, whose log takes only finite
-        numbers, only those are returned."""
+        """The summary of all held-out photos of all scenes, and ``lpips_note`` if LPIPS is missing.
+        Images of photo and variants side by side go to ``output_path``. Given a ``step``, by the
+        trainer, whose log takes only finite numbers, only those are returned."""
         training = self.training
         self.eval()
-        manager, model, lpips = self.datamanager, self.model, ReportedLpips()
+        manager = self.datamanager
+        model = self.model
+        lpips = ReportedLpips()
         reports: list[evaluation.SceneReport] = []
         for index in range(processes.rank(), len(manager.scenes), self.world_size):
             scene = manager.scenes[index]
             dense = scene.dense(keep=False)
             pruned, structure = model.pruned_scene(index, dense)
-            variants = {"dense": dense.to(model.device), "pruned": pruned, "refined": model.refiner(pruned, structure)}
-            report = evaluate_scene(model, scene, variants, scene.frames("test"), lpips, output_path, progress=True)
+            variants = {
+                "dense": dense.to(model.device),
+                "pruned": pruned,
+                "refined": model.refiner(pruned, structure),
+            }
+            report = evaluate_scene(
+                model, scene, variants, scene.frames("test"), lpips, output_path, progress=True
+            )
             report.seen_in_training = scene.identity in self.trained_on
             report.last_picture = None
             reports.append(report)
@@ -160,7 +200,9 @@ class PointSplatPipeline(VanillaPipeline):
             evaluation.print_summary(summary)
         return summary
 
-    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+    def get_training_callbacks(
+        self, attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
         """Saves the network alone at the end of training, for use without the training scenes."""
 
         def save(step: int) -> None:

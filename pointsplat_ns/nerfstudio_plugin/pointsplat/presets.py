@@ -1,8 +1,9 @@
-"""The methods ``pointsplat-paper`` and ``pointsplat-authors``: ``pointsplat`` with published settings.
+"""The methods ``pointsplat-paper`` and ``pointsplat-authors``: ``pointsplat`` with published
+settings.
 
-Sources: the paper (A. T. Tran and J. Košecká, "PointSplat: Efficient Geometry-Driven Pruning and Transformer Refinement
-for 3D Gaussian Splatting", arXiv 2604.09903), and the code that its authors released
-(github.com/anhthuan1999/pointsplat). What neither says is as in ``pointsplat``.
+Sources: the paper (A. T. Tran and J. Košecká, "PointSplat: Efficient Geometry-Driven Pruning and
+Transformer Refinement for 3D Gaussian Splatting", arXiv 2604.09903), and the code that its authors
+released (github.com/anhthuan1999/pointsplat). What neither says is as in ``pointsplat``.
 """
 
 from __future__ import annotations
@@ -22,12 +23,16 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeli
 
 
 def paper_config() -> PointSplatTrainerConfig:
-    """The method ``pointsplat-paper``. Sections, equations and tables are the paper's; "details" is the paragraph
-    "Implementation details" of section 4."""
+    """The method ``pointsplat-paper``. Sections, equations and tables are the paper's; "details" is
+    the paragraph "Implementation details" of section 4."""
     rates = dict.fromkeys(REFINER_RATES, 1e-5)  # details
-    config = _preset("paper", _paper_model(), rates, eps=1e-8)  # torch's default: the paper names none
+    config = _preset(
+        "paper", _paper_model(), rates, eps=1e-8
+    )  # torch's default: the paper names none
     config.max_num_iterations = 10_000  # details
-    config.schedule, config.drop_at = "step", 0.6  # details: "dropped by 10 at iteration 6,000"
+    # details: "dropped by 10 at iteration 6,000"
+    config.schedule = "step"
+    config.drop_at = 0.6
     config.global_norm = None  # the paper names no limit of gradients
     return config
 
@@ -53,33 +58,41 @@ def _paper_model() -> PointSplatModelConfig:
 
 
 def authors_config() -> PointSplatTrainerConfig:
-    """The method ``pointsplat-authors``: what differs from the paper in the released code, the part of which is named
-    first. The rest is as in :func:`paper_config`."""
+    """The method ``pointsplat-authors``: what differs from the paper in the released code, the part
+    of which is named first. The rest is as in :func:`paper_config`."""
     model = dataclasses.replace(
         _paper_model(),
         by="authors",  # score: z-scores of opacity logits and of a product of log-scales
         enc_depths=(2, 2, 2, 6, 2),  # backbone: its default, which nothing sets
         stem="linear",  # backbone: Linear, BatchNorm, GELU
-        raw_inputs=True,  # encoder: log-scales in the unit cube, opacity logits, SH coefficients as they are
+        # encoder: log-scales in the unit cube, opacity logits, SH coefficients as they are
+        raw_inputs=True,
         means_reach=1.0,  # heads: tanh of the residual of means, in unit cubes
         train_encoder=False,  # optimiser: it has the backbone and the heads alone
     )
-    rates = dict.fromkeys(REFINER_RATES, 3e-5) | dict.fromkeys(("means", "scales", "quats"), 1e-5)  # optimiser
+    rates = dict.fromkeys(REFINER_RATES, 3e-5) | dict.fromkeys(
+        ("means", "scales", "quats"), 1e-5
+    )  # optimiser
     rates["features_rest"] = 1e-6
     config = _preset("authors", model, rates, eps=1e-15)  # optimiser: Adam's eps
     config.max_num_iterations = 10_000  # the paper's
-    config.schedule, config.drop_at = "step", 0.7  # schedule named "cosine": MultiStep, a tenth at 7,000
+    # schedule named "cosine": MultiStep, a tenth at 7,000
+    config.schedule = "step"
+    config.drop_at = 0.7
     config.global_norm = 2.0  # training: one norm of all gradients
     return config
 
 
-def _preset(name: str, model: PointSplatModelConfig, rates: dict[str, float], eps: float) -> PointSplatTrainerConfig:
+def _preset(
+    name: str, model: PointSplatModelConfig, rates: dict[str, float], eps: float
+) -> PointSplatTrainerConfig:
     config = pointsplat_config()
     config.method_name = f"{METHOD_NAMES.refiner}-{name}"
     config.optimizers = adam(rates, eps)
     scenes = ScenesDataManagerConfig(
         supervision="photos",  # section 4, Datasets: images of the scenes
-        images_per_step=2,  # section 4, Datasets: "two random images per scene"; the released code: 1 on Replica
+        # section 4, Datasets: "two random images per scene"; the released code: 1 on Replica
+        images_per_step=2,
     )
     config.pipeline = PointSplatPipelineConfig(datamanager=scenes, model=model)
     return config

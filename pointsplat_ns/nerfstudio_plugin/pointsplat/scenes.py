@@ -1,4 +1,5 @@
-"""A trained run as a scene: its Gaussians, and its photos and poses in the frame that it was trained in."""
+"""A trained run as a scene: its Gaussians, and its photos and poses in the frame that it was
+trained in."""
 
 from __future__ import annotations
 
@@ -34,35 +35,51 @@ if TYPE_CHECKING:
 
 
 def dataparser_of(run: Run) -> DataParser:
-    """The dataparser that a run was trained with, with the same settings; those that it does not know are logged. Its
-    name is looked up among the classes that nerfstudio or an installed plugin registers, and is never imported.
-    Raises SceneError if it is not there."""
+    """The dataparser that a run was trained with, with the same settings; those that it does not
+    know are logged. Its name is looked up among the classes that nerfstudio or an installed plugin
+    registers, and is never imported. Raises SceneError if it is not there."""
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
-    classes = {f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()}
+    classes = {
+        f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()
+    }
     name = run.dataparser_class
     if name not in classes:
         raise SceneError(
-            f"{run.config_path}: trained with the dataparser {name or 'of another kind'}, which is not "
-            "installed here; install the plugin that provides it"
+            f"{run.config_path}: trained with the dataparser {name or 'of another kind'}, which is "
+            "not installed here; install the plugin that provides it"
         )
     config = classes[name]()
     fields = {f.name for f in dataclasses.fields(config)}
-    unknown = [name for name, value in run.dataparser_fields.items() if name not in fields and value is not None]
+    unknown = [
+        name
+        for name, value in run.dataparser_fields.items()
+        if name not in fields and value is not None
+    ]
     if unknown:
-        CONSOLE.log(f"{run.config_path}: settings that its dataparser no longer has are left out: {', '.join(unknown)}")
+        CONSOLE.log(
+            f"{run.config_path}: settings that its dataparser no longer has are left out: "
+            f"{', '.join(unknown)}"
+        )
     for field_name, value in run.dataparser_fields.items():
-        if field_name in fields and not isinstance(value, Tagged):  # of a Python object, the default is kept
+        if field_name in fields and not isinstance(
+            value, Tagged
+        ):  # of a Python object, the default is kept
             # Seed points are not needed.
-            setattr(config, field_name, False if field_name in ("load_seed_points", "load_3D_points") else value)
+            setattr(
+                config,
+                field_name,
+                False if field_name in ("load_seed_points", "load_3D_points") else value,
+            )
     config.data = run.data
     return config.setup()
 
 
 def corrected_poses(run: Run, poses: Tensor) -> Tensor:
-    """Poses (C, 3, 4) of a run's training photos, camera-to-world in OpenGL axes, with the corrections in its
-    checkpoint, if there are some, as nerfstudio's model applies them. Raises SceneError if the checkpoint is not
-    usable, or the run does not say how it corrects poses; DataError if it corrected another number of them."""
+    """Poses (C, 3, 4) of a run's training photos, camera-to-world in OpenGL axes, with the
+    corrections in its checkpoint, if there are some, as nerfstudio's model applies them. Raises
+    SceneError if the checkpoint is not usable, or the run does not say how it corrects poses;
+    DataError if it corrected another number of them."""
     adjustments = read_photo_fit(run.checkpoint).adjustments
     if adjustments is None:
         return poses
@@ -71,25 +88,33 @@ def corrected_poses(run: Run, poses: Tensor) -> Tensor:
             f"{run.data}: {len(poses)} training photos, but {run.checkpoint} corrects the poses of "
             f"{len(adjustments)}; put back the data as it was"
         )
-    fields = (settings.get("camera_optimizer") for settings in (run.model_fields, run.datamanager_fields))
+    fields = (
+        settings.get("camera_optimizer") for settings in (run.model_fields, run.datamanager_fields)
+    )
     modes = [field.fields.get("mode") for field in fields if isinstance(field, Tagged)]
     mode = next((mode for mode in modes if mode in ("SO3xR3", "SE3")), None)
     if mode is None:
         raise SceneError(
-            f"{run.config_path}: its camera optimizer has the mode {next(iter(modes), None)!r}, but {run.checkpoint} "
+            f"{run.config_path}: its camera optimizer has the mode {next(iter(modes), None)!r}, "
+            f"but {run.checkpoint} "
             "holds corrected poses; expected SO3xR3 or SE3; put back the config.yml of the run"
         )
-    optimizer: CameraOptimizer = CameraOptimizerConfig(mode=mode).setup(num_cameras=len(poses), device="cpu")
+    optimizer: CameraOptimizer = CameraOptimizerConfig(mode=mode).setup(
+        num_cameras=len(poses), device="cpu"
+    )
     optimizer.pose_adjustment.data = adjustments
     with torch.no_grad():
         motions = optimizer.get_correction_matrices().to(poses)
     # Rotations are about the camera's own position, translations in world axes.
-    return torch.cat([motions[:, :, :3] @ poses[:, :, :3], poses[:, :, 3:] + motions[:, :, 3:]], dim=2)
+    return torch.cat(
+        [motions[:, :, :3] @ poses[:, :, :3], poses[:, :, 3:] + motions[:, :, 3:]], dim=2
+    )
 
 
 class TrainedScene(DenseScene):
-    """One trained run: its Gaussians and its posed photos, both read when they are needed. Arguments are those of
-    :class:`DenseScene`; ``has_photos`` says whether the run's data was found."""
+    """One trained run: its Gaussians and its posed photos, both read when they are needed.
+    Arguments are those of :class:`DenseScene`; ``has_photos`` says whether the run's data was
+    found."""
 
     def __init__(
         self,
@@ -101,13 +126,15 @@ class TrainedScene(DenseScene):
         has_photos: bool = True,
     ):
         super().__init__(name, run.checkpoint, cache, poses, device)
-        self.run, self.has_photos, self.rasterize_mode = run, has_photos, run.rasterize_mode
+        self.run = run
+        self.has_photos = has_photos
+        self.rasterize_mode = run.rasterize_mode
         self._photos: dict[Split, Frames] = {}
 
     @cached_property
     def identity(self) -> str:
-        """EXPERIMENT/METHOD/TIME and the step: a scene that is trained again has another one. Its content does not
-        count."""
+        """EXPERIMENT/METHOD/TIME and the step: a scene that is trained again has another one. Its
+        content does not count."""
         run = self.run
         return f"{self.name}/{run.method_name}/{run.timestamp} step {run.step}"
 
@@ -119,39 +146,50 @@ class TrainedScene(DenseScene):
     def background(self) -> Tensor:
         """Background colour (3,), in [0, 1], that the run is evaluated with."""
         color = self.run.model_fields.get("background_color")
-        return get_color(color) if color in ("black", "white") else torch.tensor(VIEWER_BACKGROUND, **FLOATS)
+        return (
+            get_color(color)
+            if color in ("black", "white")
+            else torch.tensor(VIEWER_BACKGROUND, **FLOATS)
+        )
 
     @cached_property
     def _dataparser(self) -> DataParser:
         return dataparser_of(self.run)
 
     def _outputs(self, split: str) -> DataparserOutputs:
-        """The dataparser's outputs for a split. Raises DataError if the data is damaged, or its coordinate frame is not
-        that of the Gaussians."""
+        """The dataparser's outputs for a split. Raises DataError if the data is damaged, or its
+        coordinate frame is not that of the Gaussians."""
         try:
             outputs = self._dataparser.get_dataparser_outputs(split=split)
         except PointSplatError:
             raise
-        except Exception as error:  # nerfstudio's parsers check little: a damaged file can raise nearly anything
+        except (
+            Exception
+        ) as error:  # nerfstudio's parsers check little: a damaged file can raise nearly anything
             why = f"{type(error).__name__}: {one_line(error)}"
             raise DataError(
-                f"{self.run.data}: cannot be read as the data of {self.run.folder} ({why}); put back the data as it was"
+                f"{self.run.data}: cannot be read as the data of {self.run.folder} ({why}); put "
+                "back the data as it was"
             ) from error
         moved = (outputs.dataparser_transform[:3] - self.run.transform).abs().max()
         kept = self.run.folder / RUN_FILES.transforms
         if moved > 1e-4 or abs(outputs.dataparser_scale / self.run.scale - 1) > 1e-4:
             if not kept.is_file():
-                raise DataError(f"{kept}: no such file, so the frame of the scene is not known; put back the file")
+                raise DataError(
+                    f"{kept}: no such file, so the frame of the scene is not known; put back the "
+                    "file"
+                )
             raise DataError(
-                f"{self.run.data}: its poses are no longer in the frame that {self.run.folder} was trained in (the "
-                f"transform differs by {float(moved):.3g}, the scale is {outputs.dataparser_scale:.6g} and was "
-                f"{self.run.scale:.6g}); put back the data as it was, or train the scene again"
+                f"{self.run.data}: its poses are no longer in the frame that {self.run.folder} was "
+                f"trained in (the transform differs by {float(moved):.3g}, the scale is "
+                f"{outputs.dataparser_scale:.6g} and was {self.run.scale:.6g}); put back the data "
+                "as it was, or train the scene again"
             )
         return outputs
 
     def frames(self, split: Split) -> Frames:
-        """Photos at the run's training resolution, those of training in the poses as it corrected them; without data
-        the scene's own renders."""
+        """Photos at the run's training resolution, those of training in the poses as it corrected
+        them; without data the scene's own renders."""
         if not self.has_photos:
             return self.rendered[split]
         if split not in self._photos:
@@ -159,7 +197,9 @@ class TrainedScene(DenseScene):
             scale = float(scale) if isinstance(scale, (int, float)) else 1.0
             dataset = UndistortedDataset(self._outputs(split), scale)
             if split == "train":
-                dataset.cameras.camera_to_worlds = corrected_poses(self.run, dataset.cameras.camera_to_worlds)
+                dataset.cameras.camera_to_worlds = corrected_poses(
+                    self.run, dataset.cameras.camera_to_worlds
+                )
             self._photos[split] = Frames(dataset, cache=self.cache, device=self.device)
         return self._photos[split]
 
@@ -168,7 +208,8 @@ class TrainedScene(DenseScene):
         return self.frames(split).dataset.cameras if self.has_photos else super().cameras(split)
 
     def views(self, split: Split) -> Views:
-        """The poses of a split, on the CPU. Raises DataError if there is none, or they are not usable."""
+        """The poses of a split, on the CPU. Raises DataError if there is none, or they are not
+        usable."""
         cameras = self.cameras(split)
         if len(cameras) == 0:
             raise DataError(f"{self.run.data}: no pose in the {split} split; expected at least one")
@@ -176,20 +217,25 @@ class TrainedScene(DenseScene):
             views = views_of_cameras(cameras, self.background, self.rasterize_mode)
         except DataError as error:
             raise DataError(f"{self.run.data}: {error}") from error
-        return dataclasses.replace(views, viewmats=views.viewmats.detach().cpu(), Ks=views.Ks.detach().cpu())
+        return dataclasses.replace(
+            views, viewmats=views.viewmats.detach().cpu(), Ks=views.Ks.detach().cpu()
+        )
 
     def photos(self, split: Split) -> RunPhotos:
-        """The photos of a split, read when they are asked for. Raises DataError as :meth:`views`."""
+        """The photos of a split, read when they are asked for. Raises DataError as
+        :meth:`views`."""
         self.views(split)
         return RunPhotos(self, self.frames(split))
 
     def need_photos_as_rendered(self, instead: str) -> None:
-        """Raise a DataError, with the advice ``instead``, if the training fitted colours to each of its photos, which
-        renders of the scene do not have: by a bilateral grid, or an embedding of appearance."""
+        """Raise a DataError, with the advice ``instead``, if the training fitted colours to each of
+        its photos, which renders of the scene do not have: by a bilateral grid, or an embedding of
+        appearance."""
         colors = read_photo_fit(self.run.checkpoint).colors
         if colors:
             raise DataError(
-                f"{self.run.checkpoint}: holds {colors}, which fits colours to each training photo; renders of the "
+                f"{self.run.checkpoint}: holds {colors}, which fits colours to each training "
+                "photo; renders of the "
                 f"scene do not have them, so its training photos cannot be used; {instead}"
             )
 
@@ -198,7 +244,8 @@ class RunPhotos(Sequence[Example]):
     """Photos of a split, and the views on the CPU that they show once undistorted."""
 
     def __init__(self, scene: TrainedScene, frames: Frames):
-        self._scene, self._frames = scene, frames
+        self._scene = scene
+        self._frames = frames
         self._views: dict[int, View] = {}
 
     def __len__(self) -> int:
@@ -208,6 +255,8 @@ class RunPhotos(Sequence[Example]):
         view = self._views.get(index)
         if view is None:
             camera = self._frames.camera(index)
-            view = self._views[index] = views_of_cameras(camera, self._scene.background, self._scene.rasterize_mode)[0]
+            view = self._views[index] = views_of_cameras(
+                camera, self._scene.background, self._scene.rasterize_mode
+            )[0]
         data = self._frames.data(index)
         return Example(view, data["image"][..., :3], data.get("mask"))

@@ -1,13 +1,15 @@
 """Reads scenes in the Replica layouts of NICE-SLAM and of Semantic-NeRF, without nerfstudio.
 
-NICE-SLAM: a scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row, OpenCV axes: x
-right, y down, z forward; line k is the pose of the k-th frame by number), ``results/frame*.jpg|png`` and, optionally,
-``results/depth*.png`` (16 bit; depth along the optical axis = value / ``scale``; 0 unknown). The intrinsics are in
-``cam_params.json``, in the scene folder or in the one above it.
+NICE-SLAM: a scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row,
+OpenCV axes: x right, y down, z forward; line k is the pose of the k-th frame by number),
+``results/frame*.jpg|png`` and, optionally, ``results/depth*.png`` (16 bit; depth along the optical
+axis = value / ``scale``; 0 unknown). The intrinsics are in ``cam_params.json``, in the scene folder
+or in the one above it.
 
-Semantic-NeRF: a sequence (``room_0/Sequence_1``) holds ``traj_w_c.txt``, ``rgb/rgb_0.png`` and so on, and optionally
-``depth/depth_0.png`` (16 bit, millimetres), with poses as above. Its cameras have a horizontal field of view of 90
-degrees, which no file says; a ``cam_params.json`` overrides it.
+Semantic-NeRF: a sequence (``room_0/Sequence_1``) holds ``traj_w_c.txt``, ``rgb/rgb_0.png`` and so
+on, and optionally ``depth/depth_0.png`` (16 bit, millimetres), with poses as above. Its cameras
+have a horizontal field of view of 90 degrees, which no file says; a ``cam_params.json`` overrides
+it.
 """
 
 import json
@@ -24,11 +26,13 @@ from pointsplat_ns.io.files import logger, one_line, read_text
 from pointsplat_ns.io.pictures import exif_hint
 
 FARTHEST = 1e18
-"""Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot square them."""
+"""Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot
+square them."""
 
 
 class Layout(NamedTuple):
-    """Names in a scene folder: of the trajectory, of folders, and of files in these, whose first group is a number."""
+    """Names in a scene folder: of the trajectory, of folders, and of files in these, whose first
+    group is a number."""
 
     trajectory: str
     photos: str
@@ -37,8 +41,12 @@ class Layout(NamedTuple):
     depth: str
 
 
-NICE_SLAM = Layout("traj.txt", "results", r"frame(\d+)\.(?:jpg|jpeg|png)", "results", r"depth(\d+)\.png")
-SEMANTIC_NERF = Layout("traj_w_c.txt", "rgb", r"rgb_(\d+)\.(?:jpg|jpeg|png)", "depth", r"depth_(\d+)\.png")
+NICE_SLAM = Layout(
+    "traj.txt", "results", r"frame(\d+)\.(?:jpg|jpeg|png)", "results", r"depth(\d+)\.png"
+)
+SEMANTIC_NERF = Layout(
+    "traj_w_c.txt", "rgb", r"rgb_(\d+)\.(?:jpg|jpeg|png)", "depth", r"depth_(\d+)\.png"
+)
 
 
 @dataclass(frozen=True)
@@ -56,9 +64,9 @@ class PinholeParams:
 
     @property
     def principal_point(self) -> tuple[float, float]:
-        """Principal point in pixels from the corner of the image, as in rasterizers. If it is exactly (w / 2, h / 2) in
-        the file, it is that there, too. Otherwise the centre of the first pixel is 0, as in Replica's own file (599.5
-        of 1200) and in OpenCV."""
+        """Principal point in pixels from the corner of the image, as in rasterizers. If it is
+        exactly (w / 2, h / 2) in the file, it is that there, too. Otherwise the centre of the first
+        pixel is 0, as in Replica's own file (599.5 of 1200) and in OpenCV."""
         shift = 0.0 if (self.cx, self.cy) == (self.width / 2, self.height / 2) else 0.5
         return self.cx + shift, self.cy + shift
 
@@ -90,31 +98,39 @@ class ReplicaScene:
 
 
 def load_replica(folder: Path) -> ReplicaScene:
-    """Read a scene, but no photo. Frames whose pose is not finite, or farther than :data:`FARTHEST` (lost tracking),
-    are dropped, with one warning. A DataError names a file that is missing, unreadable or inconsistent."""
+    """Read a scene, but no photo. Frames whose pose is not finite, or farther than :data:`FARTHEST`
+    (lost tracking), are dropped, with one warning. A DataError names a file that is missing,
+    unreadable or inconsistent."""
     hint = "a scene folder holds traj.txt and results/frame*.jpg, or traj_w_c.txt and rgb/rgb_*.png"
     layouts = (NICE_SLAM, SEMANTIC_NERF)
     names = next((each for each in layouts if (folder / each.trajectory).is_file()), None)
     if names is None:
-        scenes = sorted({path.parent.name for each in layouts for path in folder.glob(f"*/{each.trajectory}")})
+        scenes = sorted(
+            {path.parent.name for each in layouts for path in folder.glob(f"*/{each.trajectory}")}
+        )
         hint = f"it contains the scenes {', '.join(scenes)}: name one of them" if scenes else hint
         raise DataError(f"{folder}: no {' or '.join(each.trajectory for each in layouts)}; {hint}")
     trajectory = folder / names.trajectory
-    photos, depths = _numbered(folder / names.photos, names.photo), _numbered(folder / names.depths, names.depth)
+    photos = _numbered(folder / names.photos, names.photo)
+    depths = _numbered(folder / names.depths, names.depth)
     if not photos:
         raise DataError(f"{folder / names.photos}: no photo found; {hint}")
     numbers = sorted(photos)
     poses = read_trajectory(trajectory)
     if len(poses) != len(numbers):
         raise DataError(
-            f"{trajectory}: {len(poses)} poses for {len(numbers)} photos in {folder / names.photos}; expected one line "
-            "per photo"
+            f"{trajectory}: {len(poses)} poses for {len(numbers)} photos in "
+            f"{folder / names.photos}; expected one line per photo"
         )
     finite = (np.abs(poses) < FARTHEST).all(axis=(1, 2))  # NaN fails too
-    keep, lost = np.flatnonzero(finite).tolist(), (np.flatnonzero(~finite) + 1).tolist()
+    keep = np.flatnonzero(finite).tolist()
+    lost = (np.flatnonzero(~finite) + 1).tolist()
     if lost:
         some = ", ".join(map(str, lost[:5])) + (" and more" if lost[5:] else "")
-        what = f"{trajectory}: {len(lost)} of {len(poses)} poses hold NaN, Inf or numbers beyond {FARTHEST:g}"
+        what = (
+            f"{trajectory}: {len(lost)} of {len(poses)} poses hold NaN, Inf or numbers beyond "
+            f"{FARTHEST:g}"
+        )
         if not keep:
             raise DataError(f"{what}; expected one that does not")
         logger.warning("%s (line %s): their frames are left out", what, some)
@@ -128,30 +144,42 @@ def load_replica(folder: Path) -> ReplicaScene:
 
 
 def _params(folder: Path, names: Layout, photo: Path) -> PinholeParams:
-    """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it, or those that all sequences
-    of Semantic-NeRF have. Raises DataError if there are none, or a number is missing or out of range."""
+    """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it, or those
+    that all sequences of Semantic-NeRF have. Raises DataError if there are none, or a number is
+    missing or out of range."""
     places = folder / "cam_params.json", folder.absolute().parent / "cam_params.json"
-    wanted = 'expected {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with positive numbers'
+    wanted = (
+        'expected {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with positive numbers'
+    )
     path = next((place for place in places if place.is_file()), None)
     if path is None and names is SEMANTIC_NERF:
         width, height = _opened(photo).size
-        return PinholeParams(width, height, width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, 1000.0, photo)
+        return PinholeParams(
+            width, height, width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, 1000.0, photo
+        )
     if path is None:
         raise DataError(f"{places[0]}: not found, nor {places[1]}; {wanted} in one of them")
     try:
         camera = json.loads(read_text(path))["camera"]
-        w, h, fx, fy, cx, cy, scale = (float(camera[key]) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
-        positive = all(0 < value < FARTHEST for value in (w, h, fx, fy, scale)) and abs(cx) + abs(cy) < FARTHEST
+        w, h, fx, fy, cx, cy, scale = (
+            float(camera[key]) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale")
+        )
+        positive = (
+            all(0 < value < FARTHEST for value in (w, h, fx, fy, scale))
+            and abs(cx) + abs(cy) < FARTHEST
+        )
         if not positive or w % 1 or h % 1:  # NaN fails too
             raise ValueError(f"{camera!s:.200}")
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise DataError(f"{path}: {type(error).__name__}: {one_line(error)}; {wanted}, whole ones of pixels") from None
+        raise DataError(
+            f"{path}: {type(error).__name__}: {one_line(error)}; {wanted}, whole ones of pixels"
+        ) from None
     return PinholeParams(int(w), int(h), fx, fy, cx, cy, scale, path)
 
 
 def read_trajectory(path: Path) -> np.ndarray:
-    """The poses of a ``traj.txt``, float64 (F, 4, 4), not yet checked to be rigid or finite. Raises DataError if the
-    file cannot be read, or a line is not 16 numbers."""
+    """The poses of a ``traj.txt``, float64 (F, 4, 4), not yet checked to be rigid or finite. Raises
+    DataError if the file cannot be read, or a line is not 16 numbers."""
     wanted = "expected one camera-to-world per line (16 numbers, a 4 x 4 matrix, row by row)"
     try:
         lines = read_text(path, 1 << 28).splitlines()
@@ -172,14 +200,14 @@ def read_trajectory(path: Path) -> np.ndarray:
 
 
 def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
-    """One photo, uint8 (H, W, 3), sRGB. Raises DataError if it is missing, broken or of another size than
-    ``params``."""
+    """One photo, uint8 (H, W, 3), sRGB. Raises DataError if it is missing, broken or of another
+    size than ``params``."""
     return np.asarray(_decoded(path, params).convert("RGB"))
 
 
 def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
-    """One depth image, float32 (H, W), scene units along the optical axis, 0 where unknown. Raises DataError if it is
-    missing or broken, not of 16 bits, or of another size than ``params``."""
+    """One depth image, float32 (H, W), scene units along the optical axis, 0 where unknown. Raises
+    DataError if it is missing or broken, not of 16 bits, or of another size than ``params``."""
     image = _decoded(path, params)
     if image.mode not in ("I;16", "I;16B", "I"):
         raise DataError(f"{path}: pixels of mode {image.mode}; expected a 16-bit grey depth image")
@@ -193,15 +221,18 @@ def _opened(path: Path) -> Any:
     try:
         return Image.open(path)
     except OSError as error:
-        raise DataError(f"{path}: not a readable picture ({type(error).__name__}); restore the file") from None
+        raise DataError(
+            f"{path}: not a readable picture ({type(error).__name__}); restore the file"
+        ) from None
 
 
 def _decoded(path: Path, params: PinholeParams) -> Any:
-    image, wanted = _opened(path), (params.width, params.height)
+    image = _opened(path)
+    wanted = (params.width, params.height)
     if image.size != wanted:
         raise DataError(
-            f"{path}: {image.width} x {image.height} pixels; expected {wanted[0]} x {wanted[1]} as in {params.path}"
-            + exif_hint(path, wanted)
+            f"{path}: {image.width} x {image.height} pixels; expected {wanted[0]} x {wanted[1]} "
+            f"as in {params.path}" + exif_hint(path, wanted)
         )
     try:
         image.load()
@@ -211,23 +242,27 @@ def _decoded(path: Path, params: PinholeParams) -> Any:
 
 
 def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """The files of a folder whose names match, by the number in the name; none if there is no such folder."""
-    matches = ((path, re.fullmatch(pattern, path.name, re.IGNORECASE)) for path in sorted(folder.glob("*")))
+    """The files of a folder whose names match, by the number in the name; none if there is no such
+    folder."""
+    matches = (
+        (path, re.fullmatch(pattern, path.name, re.IGNORECASE)) for path in sorted(folder.glob("*"))
+    )
     return {int(match.group(1)): path for path, match in matches if match}
 
 
 def _rigid(poses: np.ndarray, lines: list[int], path: Path) -> np.ndarray:
-    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD). Raises DataError if a
-    matrix is no rotation and position, such as one written column by column. Few digits cause a drift of 1e-7 to 1e-4;
-    beyond one percent the matrix holds a scale or a shear."""
+    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD).
+    Raises DataError if a matrix is no rotation and position, such as one written column by column.
+    Few digits cause a drift of 1e-7 to 1e-4; beyond one percent the matrix holds a scale or a
+    shear."""
     rotation = poses[:, :3, :3]
     sound = np.abs(poses[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) <= 1e-6
     sound &= np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2)) <= 1e-2
     sound &= np.linalg.det(rotation) > 0
     if not sound.all():
         raise DataError(
-            f"{path}: line {lines[int(np.argmin(sound))]} is no rigid pose; expected a rotation, within 0.01, a "
-            "position and the last row 0 0 0 1, row by row"
+            f"{path}: line {lines[int(np.argmin(sound))]} is no rigid pose; expected a rotation, "
+            "within 0.01, a position and the last row 0 0 0 1, row by row"
         )
     u, _, vt = np.linalg.svd(rotation)
     rigid = np.tile(np.eye(4), (len(poses), 1, 1))

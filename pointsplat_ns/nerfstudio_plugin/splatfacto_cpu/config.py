@@ -19,7 +19,10 @@ from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuPipelineConfig, SplatfactoCpuTrainer
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import (
+    SplatfactoCpuPipelineConfig,
+    SplatfactoCpuTrainer,
+)
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
 
 SPLATFACTO_STEPS = 30_000
@@ -28,8 +31,8 @@ SPLATFACTO_STEPS = 30_000
 
 @dataclass
 class FallingRate(SchedulerConfig):
-    """A learning rate that falls exponentially, in ``max_steps``, from one multiple of the optimiser's to another. A
-    training that resumes with another length has that length's rates."""
+    """A learning rate that falls exponentially, in ``max_steps``, from one multiple of the
+    optimiser's to another. A training that resumes with another length has that length's rates."""
 
     first: float = 1.0
     last: float = 1.0
@@ -40,9 +43,12 @@ class FallingRate(SchedulerConfig):
         return self
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        """torch's scheduler of an optimiser; ``lr_init`` is the optimiser's rate, which it has already."""
+        """torch's scheduler of an optimiser; ``lr_init`` is the optimiser's rate, which it has
+        already."""
         ratio = self.last / self.first
-        return LambdaLR(optimizer, lambda step: self.first * ratio ** min(1.0, step / self.max_steps))
+        return LambdaLR(
+            optimizer, lambda step: self.first * ratio ** min(1.0, step / self.max_steps)
+        )
 
 
 @dataclass
@@ -51,30 +57,32 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
 
     _target: type = field(default_factory=lambda: SplatfactoCpuTrainer)
     scale_schedules: bool = True
-    """If the run is shorter than 30,000 steps, shorten Splatfacto's schedules (resolution, SH degree, densification,
-    learning rates) in proportion, let learning rates begin higher, and the scene grow to fewer Gaussians. Options set
-    by hand are not changed."""
+    """If the run is shorter than 30,000 steps, shorten Splatfacto's schedules (resolution, SH
+    degree, densification, learning rates) in proportion, let learning rates begin higher, and the
+    scene grow to fewer Gaussians. Options set by hand are not changed."""
 
     def setup(self, **kwargs) -> Trainer:
         """Build the trainer with a copy of this config whose rates and limits of gradients are set.
 
-        A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes from, or when
-        ``seconds`` are over, as if it had not been stopped.
+        A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes
+        from, or when ``seconds`` are over, as if it had not been stopped.
         """
         return self._target(fitted_schedules(self) if self.scale_schedules else self, **kwargs)
 
 
 def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainerConfig:
-    """A copy of a config with Splatfacto's 30,000-step schedules shortened to its length: ``max_num_iterations``, and
-    the steps before if it resumes from a checkpoint.
+    """A copy of a config with Splatfacto's 30,000-step schedules shortened to its length:
+    ``max_num_iterations``, and the steps before if it resumes from a checkpoint.
 
-    Model settings are changed only if they have Splatfacto's default values, learning-rate schedules only if they end
-    at 30,000. ``refine_every``, over which gradients are gathered, shrinks only below 7,000 steps and never below 25.
+    Model settings are changed only if they have Splatfacto's default values, learning-rate
+    schedules only if they end at 30,000. ``refine_every``, over which gradients are gathered,
+    shrinks only below 7,000 steps and never below 25.
 
-    Few steps can train only few Gaussians, and have to take them far. So the learning rates of Gaussians begin higher,
-    by the root of how many times shorter the run is, but at most eight times, and end as Splatfacto's. The gradient
-    above which a Gaussian is split or duplicated grows by the root of that. Gaussians are not split by their size on
-    screen: the small pictures at the beginning make all of them look large.
+    Few steps can train only few Gaussians, and have to take them far. So the learning rates of
+    Gaussians begin higher, by the root of how many times shorter the run is, but at most eight
+    times, and end as Splatfacto's. The gradient above which a Gaussian is split or duplicated grows
+    by the root of that. Gaussians are not split by their size on screen: the small pictures at the
+    beginning make all of them look large.
     """
     length = max(1, config.first_step() + config.max_num_iterations)
     share = min(1.0, length / SPLATFACTO_STEPS)
@@ -82,7 +90,9 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     defaults = SplatfactoCpuModelConfig()
     model = config.pipeline.model
     steps = ["warmup_length", "resolution_schedule", "sh_degree_interval", "stop_split_at"]
-    fitted: dict[str, float] = {name: max(1, round(share * getattr(defaults, name))) for name in steps}
+    fitted: dict[str, float] = {
+        name: max(1, round(share * getattr(defaults, name))) for name in steps
+    }
     fitted["refine_every"] = min(defaults.refine_every, max(25, round(length / 70)))
     haste = min(8.0, 1 / math.sqrt(share))
     fitted["densify_grad_thresh"] = math.sqrt(haste) * defaults.densify_grad_thresh
@@ -97,7 +107,10 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
         if haste > 1 and name in PARAMETERS and group == own[name]:
             last = 1.0 if schedule is None else schedule.lr_final / group["optimizer"].lr
             group["scheduler"] = FallingRate(first=haste, last=last, max_steps=length)
-        elif isinstance(schedule, ExponentialDecaySchedulerConfig) and schedule.max_steps == SPLATFACTO_STEPS:
+        elif (
+            isinstance(schedule, ExponentialDecaySchedulerConfig)
+            and schedule.max_steps == SPLATFACTO_STEPS
+        ):
             schedule.max_steps = max(1, round(share * SPLATFACTO_STEPS))
             schedule.warmup_steps = round(share * schedule.warmup_steps)
     return config
@@ -107,8 +120,13 @@ def _optimizers() -> dict[str, dict[str, Any]]:
     """Splatfacto's optimisers and learning-rate schedules."""
 
     def group(lr: float, lr_final: float | None = None, **schedule) -> dict[str, Any]:
-        decay = ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=SPLATFACTO_STEPS, **schedule)
-        return {"optimizer": FusedAdamConfig(lr=lr, eps=1e-15), "scheduler": decay if lr_final else None}
+        decay = ExponentialDecaySchedulerConfig(
+            lr_final=lr_final, max_steps=SPLATFACTO_STEPS, **schedule
+        )
+        return {
+            "optimizer": FusedAdamConfig(lr=lr, eps=1e-15),
+            "scheduler": decay if lr_final else None,
+        }
 
     return {
         "means": group(1.6e-4, 1.6e-6),
@@ -123,8 +141,9 @@ def _optimizers() -> dict[str, dict[str, Any]]:
 
 
 def splatfacto_cpu_config() -> TrainerConfig:
-    """The ``splatfacto-cpu`` method: 7,000 steps, the shorter of the two lengths in the 3DGS paper, which take a CPU
-    about an hour with small photos. It logs to tensorboard by default, as a viewer would compete for the CPU."""
+    """The ``splatfacto-cpu`` method: 7,000 steps, the shorter of the two lengths in the 3DGS paper,
+    which take a CPU about an hour with small photos. It logs to tensorboard by default, as a viewer
+    would compete for the CPU."""
     return SplatfactoCpuTrainerConfig(
         method_name="splatfacto-cpu",
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
@@ -134,7 +153,9 @@ def splatfacto_cpu_config() -> TrainerConfig:
         steps_per_eval_image=500,
         steps_per_eval_all_images=0,
         pipeline=SplatfactoCpuPipelineConfig(
-            datamanager=LazyImageDatamanagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True)),
+            datamanager=LazyImageDatamanagerConfig(
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True)
+            ),
             model=SplatfactoCpuModelConfig(),
         ),
         optimizers=_optimizers(),

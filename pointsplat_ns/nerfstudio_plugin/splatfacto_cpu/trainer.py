@@ -36,26 +36,32 @@ class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
 
 
 class SplatfactoCpuPipeline(VanillaPipeline):
-    """nerfstudio's pipeline. A metric that cannot be computed is null in its evaluation, never NaN."""
+    """nerfstudio's pipeline. A metric that cannot be computed is null in its evaluation, never
+    NaN."""
 
     datamanager: LazyImageDatamanager
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Mean metrics over the held-out frames; a DataError if no frame is held out. Given a ``step``, by the trainer,
-        whose log takes only finite numbers, other metrics are left out. Without it, as in ``ns-eval``, they are None,
-        and ``lpips_note`` says why LPIPS is missing."""
+        """Mean metrics over the held-out frames; a DataError if no frame is held out. Given a
+        ``step``, by the trainer, whose log takes only finite numbers, other metrics are left out.
+        Without it, as in ``ns-eval``, they are None, and ``lpips_note`` says why LPIPS is
+        missing."""
         if not self.datamanager.eval_dataset:
             raise DataError(
-                f"{self.datamanager.get_datapath()}: no frame is held out, so there is nothing to evaluate on; "
-                "expected at least one: change the dataparser's split"
+                f"{self.datamanager.get_datapath()}: no frame is held out, so there is nothing to "
+                "evaluate on; expected at least one: change the dataparser's split"
             )
-        self.model.lpips = lpips = LpipsMetric()  # a new one, so that its reason is of this evaluation
+        self.model.lpips = lpips = (
+            LpipsMetric()
+        )  # a new one, so that its reason is of this evaluation
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
         if step is not None:
             return {name: value for name, value in metrics.items() if math.isfinite(value)}
-        report: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+        report: dict[str, Any] = {
+            name: value if math.isfinite(value) else None for name, value in metrics.items()
+        }
         if lpips.reason is not None:
             report |= {"lpips": None, "lpips_note": lpips.reason}
         return report
@@ -83,8 +89,8 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         return self.pipeline.datamanager.latest_photo
 
     def state_to_resume(self) -> dict[str, Any]:
-        """Random numbers to come, the order of the photos, and what densification has gathered, as plain values and
-        tensors that torch loads with ``weights_only``."""
+        """Random numbers to come, the order of the photos, and what densification has gathered, as
+        plain values and tensors that torch loads with ``weights_only``."""
         manager: Any = self.pipeline.datamanager
         kind, keys, *rest = np.random.get_state()
         state: dict[str, Any] = {
@@ -99,25 +105,37 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         return state
 
     def _load_checkpoint(self) -> None:
-        """As nerfstudio's; then put back :meth:`state_to_resume`. Of another number of photos, their order is left
-        alone."""
+        """As nerfstudio's; then put back :meth:`state_to_resume`. Of another number of photos,
+        their order is left alone."""
         super()._load_checkpoint()
-        folder, path = self.config.load_dir, self.config.load_checkpoint
+        folder = self.config.load_dir
+        path = self.config.load_checkpoint
         if folder is not None:
             path = folder / f"step-{self._start_step - 1:09d}.ckpt"
-        state = None if path is None else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
+        state = (
+            None
+            if path is None
+            else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
+        )
         if state is None:  # those of nerfstudio's own methods have none
             return
         torch.set_rng_state(state["torch"])
         random.setstate(state["python"])
         kind, keys, *rest = state["numpy"]
         np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
-        model, manager = self.pipeline.model, self.pipeline.datamanager
+        model = self.pipeline.model
+        manager = self.pipeline.datamanager
         for name, value in state["densification"].items():
-            model.strategy_state[name] = value.clone().to(model.device) if isinstance(value, torch.Tensor) else value
+            model.strategy_state[name] = (
+                value.clone().to(model.device) if isinstance(value, torch.Tensor) else value
+            )
         numbers = len(manager.train_dataset), len(manager.eval_dataset)
         lists = [state[name] for name in FRAMES_TO_COME]
-        if all(0 <= index < number for number, indices in zip(numbers, lists, strict=True) for index in indices):
+        if all(
+            0 <= index < number
+            for number, indices in zip(numbers, lists, strict=True)
+            for index in indices
+        ):
             for name, indices in zip(FRAMES_TO_COME, lists, strict=True):
                 setattr(manager, name, list(indices))
             if "frames" in state and hasattr(manager, "random_generator"):
@@ -126,9 +144,9 @@ class SplatfactoCpuTrainer(StoppableTrainer):
 
 @contextmanager
 def tiny_as_zero() -> Iterator[None]:
-    """Within, this thread, and those it starts, take floats below the smallest normal one (1e-38) as 0. Many processors
-    take ten times as long for such numbers. Adam's averages are full of them where a Gaussian has not been seen for 800
-    steps: they fall by a tenth with each."""
+    """Within, this thread, and those it starts, take floats below the smallest normal one (1e-38)
+    as 0. Many processors take ten times as long for such numbers. Adam's averages are full of them
+    where a Gaussian has not been seen for 800 steps: they fall by a tenth with each."""
     before = takes_tiny_as_zero()
     torch.set_flush_denormal(True)
     try:

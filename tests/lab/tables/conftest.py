@@ -41,10 +41,14 @@ def views_of_room() -> ps.Views:
 
 @pytest.fixture()
 def room(tmp_path, views_of_room, no_lpips, monkeypatch) -> Path:
-    """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps, figures are
-    none."""
-    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views_of_room[:count])
-    monkeypatch.setattr(layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure"))
+    """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps,
+    figures are none."""
+    monkeypatch.setattr(
+        view_source.Sampler, "views", lambda sampler, count, *_, **options: views_of_room[:count]
+    )
+    monkeypatch.setattr(
+        layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure")
+    )
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"
@@ -52,7 +56,8 @@ def room(tmp_path, views_of_room, no_lpips, monkeypatch) -> Path:
 
 @pytest.fixture()
 def measured(room, tmp_path) -> Callable[..., Tables]:
-    """A function that measures the room's tables in a folder, at 30 %, with two steps of fine-tuning."""
+    """A function that measures the room's tables in a folder, at 30 %, with two steps of
+    fine-tuning."""
 
     def measure(*scenes: Path, folder: Path = tmp_path / "tables", **options):
         usual = {"keeps": (0.3,), "views": 2, "fine_tune": 2, "splat_transform": "/no/such/program"}

@@ -13,20 +13,47 @@ from lab.tables.ways import WAYS, cell_key
 from making import ball
 
 
-def add_scene(tables, name, group="scenes", dataset="", worse=0.0, photos=True, without=(), differs=""):
+def add_scene(
+    tables, name, group="scenes", dataset="", worse=0.0, photos=True, without=(), differs=""
+):
     """Add the cells of a scene of 1,000 Gaussians at 30 and 10 %, in all ways but those without."""
-    about = {"name": name, "path": name, "dataset": dataset, "group": group, "origin": "held-out photos"}
+    about = {
+        "name": name,
+        "path": name,
+        "dataset": dataset,
+        "group": group,
+        "origin": "held-out photos",
+    }
     about |= {"machine": "a machine", "views": 3, "width": 64, "height": 48, "differs": differs}
     tables.scenes[name] = about
     for number, (way, share) in enumerate(WAYS.cells((0.3, 0.1))):
         if way.name in without:
             continue
-        lost, key = 0.0 if way == WAYS.dense else 1 + worse + 0.1 * number, cell_key(name, way, share)
-        point = {"key": key, "label": way.label, "command": "", "share": share, "sh_degree": 3, "seconds": 1.5}
-        point |= {"gaussians": round(1000 * share), "bytes": round(248_000 * share), "frame_ms": 10 * share}
+        lost = 0.0 if way == WAYS.dense else 1 + worse + 0.1 * number
+        key = cell_key(name, way, share)
+        point = {
+            "key": key,
+            "label": way.label,
+            "command": "",
+            "share": share,
+            "sh_degree": 3,
+            "seconds": 1.5,
+        }
+        point |= {
+            "gaussians": round(1000 * share),
+            "bytes": round(248_000 * share),
+            "frame_ms": 10 * share,
+        }
         point["against_dense"] = {"psnr": 40 - lost if lost else None, "ssim": 0.9, "lpips": 0.1}
         point["against_photos"] = {"psnr": 30 - lost, "ssim": 0.8, "lpips": 0.2} if photos else None
-        cell = {"way": way.name, "point": point, "made_with": "", "seed": 0, "version": "0.1.0", "commit": ""}
+        cell = {
+            "way": way.name,
+            "point": point,
+            "made_with": "",
+            "seed": 0,
+            "version": "0.1.0",
+            "commit": "",
+        }
         for kind, edges in (("opacities", OPACITY_EDGES), ("volumes", VOLUME_EDGES)):
             counts = [0] * 9 + [7] + [0] * (len(edges) - 11)
             cell[kind] = counts if way in WAYS.figure_4 else None
@@ -61,15 +88,32 @@ def test_tables_have_the_papers_rows():
     tables = add_scene(Tables(), "fox")
     one, two, three, four = tables_of(tables)
     assert len(one.rows) == 25 and one.header[:5] == ("kept", "method", "PSNR", "SSIM", "LPIPS")
-    first, merged = rows_of(one), photos_psnr(tables, "fox/merge/10%")
-    assert first["100 %", "3DGS (dense)"] == ("30.00", "0.800", "0.200", "-", "0.900", "0.100", "fox 30.00", "", "1")
+    first = rows_of(one)
+    merged = photos_psnr(tables, "fox/merge/10%")
+    assert first["100 %", "3DGS (dense)"] == (
+        "30.00",
+        "0.800",
+        "0.200",
+        "-",
+        "0.900",
+        "0.100",
+        "fox 30.00",
+        "",
+        "1",
+    )
     row = first["10 %", "merge (our default)"]
     assert (row[0], row[6]) == (f"{merged:.2f}", f"fox {merged:.2f} ({merged - 30:+.2f})")
     assert rows_of(two)["10 %", "PUP-3DGS"] == ("100", "1e+03", "0.0248", "1")
-    names = [(weight, name) for weight in ("0.1", "0.3", "0.5", "0.7", "0.9") for name in ("PointSplat*", "PointSplat")]
+    names = [
+        (weight, name)
+        for weight in ("0.1", "0.3", "0.5", "0.7", "0.9")
+        for name in ("PointSplat*", "PointSplat")
+    ]
     assert [row[:2] for row in three.rows] == names
     assert [row[0] for row in four.rows] == ["I", "II", "III", "IV", "V"]
-    assert all(len(row) == len(table.header) for table in (one, two, three, four) for row in table.rows)
+    assert all(
+        len(row) == len(table.header) for table in (one, two, three, four) for row in table.rows
+    )
 
 
 def test_a_table_takes_its_means_over_the_same_scenes():
@@ -82,7 +126,10 @@ def test_a_table_takes_its_means_over_the_same_scenes():
     assert one.title.endswith("2 scenes") and rows_of(one)["100 %", "3DGS (dense)"][-1] == "2"
     both = [photos_psnr(tables, f"{name}/paper/10%") for name in ("fox", "kitchen")]
     row = rows_of(one)["10 %", "PointSplat*"]
-    assert row[0] == f"{sum(both) / 2:.2f}" and row[6] == f"kitchen {both[1]:.2f} ({both[1] - 30:+.2f})"
+    assert (
+        row[0] == f"{sum(both) / 2:.2f}"
+        and row[6] == f"kitchen {both[1]:.2f} ({both[1] - 30:+.2f})"
+    )
     assert rows_of(one)["10 %", "PointSplat"][-1] == rows_of(two)["10 %", "PointSplat"][-1] == "1 †"
     assert any("not over the scenes of the other rows (fox, kitchen)" in note for note in one.notes)
     assert [row[-1] for row in four.rows] == ["2", "2", "2", "2", "1 †"]
@@ -91,7 +138,9 @@ def test_a_table_takes_its_means_over_the_same_scenes():
 @pytest.fixture()
 def written(monkeypatch, tmp_path):
     """A function that writes tables without the figure, and gives the text of all files."""
-    monkeypatch.setattr(layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure"))
+    monkeypatch.setattr(
+        layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure")
+    )
 
     def write(tables):
         write_tables(tables, tmp_path, (0.3, 0.1))
@@ -102,12 +151,21 @@ def written(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(
     "name, dataset, differs",
-    [("room0", "", ""), ("410c470782", "", ""), ("room0", "replica", ""), ("room0", "Replica", "10 of 200 photos")],
+    [
+        ("room0", "", ""),
+        ("410c470782", "", ""),
+        ("room0", "replica", ""),
+        ("room0", "Replica", "10 of 200 photos"),
+    ],
 )
-def test_the_papers_figures_never_stand_beside_another_dataset_or_protocol(written, name, dataset, differs):
+def test_the_papers_figures_never_stand_beside_another_dataset_or_protocol(
+    written, name, dataset, differs
+):
     tables = add_scene(Tables(), name, "Replica", dataset, differs=differs)
     files = written(tables)
-    assert not [column for table in tables_of(tables) for column in table.header if "paper" in column]
+    assert not [
+        column for table in tables_of(tables) for column in table.header if "paper" in column
+    ]
     text = files["tables.md"]
     assert json.loads(files["tables.json"])["paper"] == {}
     assert "(paper)" not in text and "39.40" not in text and "29.81" not in text
@@ -120,10 +178,16 @@ def test_they_stand_beside_ours_where_the_dataset_is_the_same(written):
     files = written(tables)
     assert [*tables.groups()] == ["ScanNet++", "Replica"]
     one, two, three, four = Layout(tables, "Replica", ["room0"], ()).tables()[:4]
-    assert one.header[-3:] == three.header[-3:] == ("scenes", "PSNR (paper)", "SSIM (paper)")  # its LPIPS is by VGG
+    assert (
+        one.header[-3:] == three.header[-3:] == ("scenes", "PSNR (paper)", "SSIM (paper)")
+    )  # its LPIPS is by VGG
     assert rows_of(one)["10 %", "PointSplat"][-2:] == ("29.81", "0.902")
     assert rows_of(one)["10 %", "merge (our default)"][-2:] == ("-", "-")
-    assert "paper" not in str(two.header) and "paper" not in str(four.header)  # the paper does not say of which scenes
+    assert "paper" not in str(two.header) and "paper" not in str(
+        four.header
+    )  # the paper does not say of which scenes
     first = Layout(tables, "ScanNet++", ["0a5c013435"], ()).tables()
     assert rows_of(first[3])["V", "yes"][-2:] == ("23.46", "0.855")
-    assert json.loads(files["tables.json"])["paper"]["Replica"]["table 1, pup, 10%"]["psnr"] == 17.34
+    assert (
+        json.loads(files["tables.json"])["paper"]["Replica"]["table 1, pup, 10%"]["psnr"] == 17.34
+    )

@@ -28,7 +28,13 @@ def all_weights(weights):
     return [
         weights(
             f"{network.encoder}-{network.by}-{network.opacity_weight}-{network.use_appearance:d}{network.use_position:d}",
-            {"by": network.by, "keep": 0.1, "more_keeps": [0.3], "opacity_weight": network.opacity_weight, "steps": 24},
+            {
+                "by": network.by,
+                "keep": 0.1,
+                "more_keeps": [0.3],
+                "opacity_weight": network.opacity_weight,
+                "steps": 24,
+            },
             encoder=network.encoder,
             use_appearance=network.use_appearance,
             use_position=network.use_position,
@@ -40,26 +46,47 @@ def all_weights(weights):
 def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, tmp_path):
     tables = measured(refiners=all_weights, splat_transform=peer(tmp_path, "3.7.0"))
     cells = cells_of(tables)
-    assert {*cells} == {(way.name, share) for way, share in WAYS.cells((0.3,))} and tables.missing == {}
+    assert {*cells} == {
+        (way.name, share) for way, share in WAYS.cells((0.3,))
+    } and tables.missing == {}
     for (way, share), cell in cells.items():
         point = cell["point"]
-        assert point["gaussians"] == round(400 * share) and point["key"] == f"room/{way}/{100 * share:g}%"
-        assert point["command"].startswith("python -m lab.tables ") and f"--only {point['key']}" in point["command"]
+        assert (
+            point["gaussians"] == round(400 * share)
+            and point["key"] == f"room/{way}/{100 * share:g}%"
+        )
+        assert (
+            point["command"].startswith("python -m lab.tables ")
+            and f"--only {point['key']}" in point["command"]
+        )
         assert cell["version"] == ps.__version__ and cell["seed"] == 0 and point["frame_ms"] > 0
-        assert point["against_photos"] is None and (way == "dense" or point["against_dense"]["psnr"] < 100)
+        assert point["against_photos"] is None and (
+            way == "dense" or point["against_dense"]["psnr"] < 100
+        )
         assert (cell["opacities"] is not None) == (way in {shown.name for shown in WAYS.figure_4})
-    psnr = {way: cell["point"]["against_dense"]["psnr"] for (way, share), cell in cells.items() if share == 0.3}
-    assert psnr["lightgaussian-tuned"] != psnr["lightgaussian"] and psnr["pointsplat"] != psnr["paper"]
+    psnr = {
+        way: cell["point"]["against_dense"]["psnr"]
+        for (way, share), cell in cells.items()
+        if share == 0.3
+    }
+    assert (
+        psnr["lightgaussian-tuned"] != psnr["lightgaussian"] and psnr["pointsplat"] != psnr["paper"]
+    )
     assert psnr["splat-transform"] != psnr["splat-transform-adaptive"]
     made_with = {way: cell["made_with"] for (way, share), cell in cells.items() if share == 0.3}
-    assert made_with["splat-transform"] == "splat-transform 3.7.0 -d" and made_with["pup-tuned"] == "2 steps"
+    assert (
+        made_with["splat-transform"] == "splat-transform 3.7.0 -d"
+        and made_with["pup-tuned"] == "2 steps"
+    )
     assert made_with["pointsplat"].endswith(
-        "(664,563 parameters; norm by scene; dual encoder, trained on scenes pruned by paper, lambda 0.3, "
-        "keep 0.1, 0.3; steps 24)"
+        "(664,563 parameters; norm by scene; dual encoder, trained on scenes pruned by paper, "
+        "lambda 0.3, keep 0.1, 0.3; steps 24)"
     )
     page = (tmp_path / "tables" / "tables.md").read_text()
     assert "| 30 % | LightGaussian |" in page and "| 2 steps | 1 |" in page and "| weights " in page
-    assert "--refiners" in cells["pointsplat", 0.3]["point"]["command"] and "not measured" not in page
+    assert (
+        "--refiners" in cells["pointsplat", 0.3]["point"]["command"] and "not measured" not in page
+    )
     assert Tables.read(tmp_path / "tables").cells == json.loads(json.dumps(tables.cells))
 
 
@@ -71,7 +98,9 @@ def test_a_cell_is_what_the_functions_of_the_package_make(measured, room):
         ("merge", 0.3, ps.prune(dense, 0.3)),
     ):
         wanted, _ = DenseReference(dense, ps.sample_views(dense, 2, 48, 36)).psnr(small)
-        assert cells[way, share]["point"]["against_dense"]["psnr"] == pytest.approx(wanted, abs=1e-4)
+        assert cells[way, share]["point"]["against_dense"]["psnr"] == pytest.approx(
+            wanted, abs=1e-4
+        )
 
 
 def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights):
@@ -79,18 +108,30 @@ def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights
     other = weights("merged", {"by": "merge", "keep": 0.1})
     tables = measured(refiners=[other], only=["room/dense/*", "room/p*/*", "room/splat*/*"])
     ways = {way for way, _ in cells_of(tables)}
-    assert not ways & {"pointsplat", "pointsplat-0.1", "paper-splatformer", "splat-transform"} and "paper" in ways
+    assert (
+        not ways & {"pointsplat", "pointsplat-0.1", "paper-splatformer", "splat-transform"}
+        and "paper" in ways
+    )
     said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]
     assert said == tables.missing
-    assert said["room/pointsplat/30%"].startswith("no weights were given (--refiners) of a dual encoder, trained on")
-    assert said["room/splat-transform/30%"] == "splat-transform cannot be run (/no/such/program: FileNotFoundError)"
-    rows = [line for line in (tmp_path / "tables" / "tables.md").read_text().splitlines() if "| PointSplat |" in line]
+    assert said["room/pointsplat/30%"].startswith(
+        "no weights were given (--refiners) of a dual encoder, trained on"
+    )
+    assert (
+        said["room/splat-transform/30%"]
+        == "splat-transform cannot be run (/no/such/program: FileNotFoundError)"
+    )
+    rows = [
+        line
+        for line in (tmp_path / "tables" / "tables.md").read_text().splitlines()
+        if "| PointSplat |" in line
+    ]
     assert rows and all("| not measured | - |" in line for line in rows)
 
 
 TRAIN = (
-    "to train them: ns-train pointsplat --data SCENES --pipeline.model.encoder dual --pipeline.model.by paper "
-    "--pipeline.model.keep 0.3 --pipeline.model.opacity-weight 0.3"
+    "to train them: ns-train pointsplat --data SCENES --pipeline.model.encoder dual "
+    "--pipeline.model.by paper --pipeline.model.keep 0.3 --pipeline.model.opacity-weight 0.3"
 )
 
 
@@ -102,16 +143,22 @@ TRAIN = (
         ({"keep": 0.3, "scenes": ["hall", "room"]}, "were trained on this scene"),
     ],
 )
-def test_weights_of_another_budget_or_that_know_the_scene_fill_no_row(measured, weights, trained, why):
+def test_weights_of_another_budget_or_that_know_the_scene_fill_no_row(
+    measured, weights, trained, why
+):
     other = weights("other", {"by": "paper", **trained})
     tables = measured(refiners=[other], only=["room/pointsplat/30%", "room/paper/30%"])
     assert [*cells_of(tables)] == [("paper", 0.3)] and why in tables.missing["room/pointsplat/30%"]
 
 
 def test_an_interrupted_run_goes_on_and_loses_nothing(measured, tmp_path, monkeypatch):
-    few, every = ("dense", "paper", "lightgaussian"), Ways.cells
-    monkeypatch.setattr(Ways, "cells", lambda *given: [cell for cell in every(*given) if cell[0].name in few])
-    figures, asked = Judge.figures, []
+    few = ("dense", "paper", "lightgaussian")
+    every = Ways.cells
+    monkeypatch.setattr(
+        Ways, "cells", lambda *given: [cell for cell in every(*given) if cell[0].name in few]
+    )
+    figures = Judge.figures
+    asked = []
 
     def interrupted(self, scene):
         asked.append(scene)
@@ -127,8 +174,12 @@ def test_an_interrupted_run_goes_on_and_loses_nothing(measured, tmp_path, monkey
     assert [*before] == ["room/dense/100%", "room/paper/10%", "room/paper/30%"]
     assert "3DGS (dense)" in (tmp_path / "tables" / "tables.md").read_text()
     after = measured().cells
-    assert {key: after[key] for key in before} == before  # also their times: they are not measured again
-    monkeypatch.setattr(Judge, "figures", lambda *args: pytest.fail("nothing is left to be measured"))
+    assert {
+        key: after[key] for key in before
+    } == before  # also their times: they are not measured again
+    monkeypatch.setattr(
+        Judge, "figures", lambda *args: pytest.fail("nothing is left to be measured")
+    )
     measured()
 
 
@@ -136,7 +187,10 @@ def test_tables_are_of_all_scenes_of_the_folder(measured, tmp_path, room):
     ps.save(box_room(1, 300), tmp_path / "hall.ply")
     only = ["*/paper/30%", "*/dense/*"]
     measured(only=only, groups=["halls=room"])
-    assert measured(tmp_path / "hall.ply", only=only).groups() == {"halls": ["room"], "scenes": ["hall"]}
+    assert measured(tmp_path / "hall.ply", only=only).groups() == {
+        "halls": ["room"],
+        "scenes": ["hall"],
+    }
     both = measured(tmp_path / "hall.ply", room, only=only, groups=["both=room,hall"])
     assert both.groups() == {"both": ["hall", "room"]}
 
@@ -144,7 +198,10 @@ def test_tables_are_of_all_scenes_of_the_folder(measured, tmp_path, room):
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"only": ["room/magic/10%"]}, "room/magic/10%: no such cell; expected a name such as fox/merge/10%"),
+        (
+            {"only": ["room/magic/10%"]},
+            "room/magic/10%: no such cell; expected a name such as fox/merge/10%",
+        ),
         ({"keeps": (0.3, 1.5)}, "keeps are 0.3, 1.5; expected shares"),
         ({"views": 0}, "views: 0; expected at least 1"),
         ({"fine_tune": -1}, "fine tune: -1; expected at least 1"),
@@ -158,11 +215,15 @@ def test_options_that_mean_nothing_are_refused(measured, options, said):
         measured(**options)
 
 
-@pytest.mark.parametrize("content", ["", "[]", "[" * 100_000, '{"format": "pointsplat-tables"}', '{"format": 3}'])
+@pytest.mark.parametrize(
+    "content", ["", "[]", "[" * 100_000, '{"format": "pointsplat-tables"}', '{"format": 3}']
+)
 def test_damaged_cells_are_refused_in_one_line(measured, tmp_path, content):
     (tmp_path / "tables").mkdir()
     (tmp_path / "tables" / "tables.json").write_text(content)
-    with pytest.raises(SceneError, match="tables.json: not the cells of tables .*--force") as refused:
+    with pytest.raises(
+        SceneError, match="tables.json: not the cells of tables .*--force"
+    ) as refused:
         measured()
     assert "\n" not in str(refused.value)
 

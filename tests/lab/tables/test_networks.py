@@ -31,9 +31,15 @@ def written(command: str, log: Path) -> None:
         [*network.heads.mlps["opacities"].modules()][-1].bias.fill_(0.3 * torch.rand(()))
     weight = {"opacity_weight": float(model["opacity-weight"])} if "opacity-weight" in model else {}
     known = {"by": model["by"], "keep": float(model["keep"]), **weight, "scenes": "wall-a"}
-    known |= {"size": model["size"], "steps": int(given["max-num-iterations"]), "pixel_loss": model["pixel-loss"]}
+    known |= {
+        "size": model["size"],
+        "steps": int(given["max-num-iterations"]),
+        "pixel_loss": model["pixel-loss"],
+    }
     known["lpips_weight"] = float(model["lpips-weight"])
-    folder = Path(given["output-dir"]) / given["experiment-name"] / "pointsplat" / given["timestamp"]
+    folder = (
+        Path(given["output-dir"]) / given["experiment-name"] / "pointsplat" / given["timestamp"]
+    )
     save_refiner(network, folder / "refiner.safetensors", known)
 
 
@@ -55,7 +61,10 @@ def test_an_interrupted_training_goes_on_where_it_was(small, tmp_path, monkeypat
     write_run(folder, 2, 5)
     small(shard=NUMBER["pointsplat-iii-10"], steps=5)
     options = dict(zip(asked[0], asked[0][1:], strict=False))
-    assert (options["--max-num-iterations"], options["--load-dir"]) == ("3", str(folder / "nerfstudio_models"))
+    assert (options["--max-num-iterations"], options["--load-dir"]) == (
+        "3",
+        str(folder / "nerfstudio_models"),
+    )
     (folder / "refiner.safetensors").touch()
     small(shard=NUMBER["pointsplat-iii-10"])
     assert len(asked) == 1, "it is finished"
@@ -69,11 +78,19 @@ def test_networks_fill_all_rows_and_all_figures(small, room, measured, tmp_path,
     monkeypatch.setattr(networks, "run", lambda *_: pytest.fail("all are finished"))
     small(seeds=2)
     ps.save(box_room(1, 300), tmp_path / "hall.ply")
-    only = [f"*/{way.name}/10*" for way, _ in WAYS.cells((0.1,)) if way.network or way in WAYS.figure_4]
+    only = [
+        f"*/{way.name}/10*" for way, _ in WAYS.cells((0.1,)) if way.network or way in WAYS.figure_4
+    ]
     tables = measured(tmp_path / "hall.ply", refiners=[trained], only=only, keeps=(0.1,))
-    assert tables.missing == {} and len({cell["way"] for cell in tables.cells.values()}) == len(set(only))
+    assert tables.missing == {} and len({cell["way"] for cell in tables.cells.values()}) == len(
+        set(only)
+    )
     both = tables.cells["hall/pointsplat-ii/10%"]
-    assert len(both["psnr"]) == 2 and both["made_with"].count("steps 3") == 1 and "size tiny" in both["made_with"]
+    assert (
+        len(both["psnr"]) == 2
+        and both["made_with"].count("steps 3") == 1
+        and "size tiny" in both["made_with"]
+    )
     assert both["point"]["against_dense"]["psnr"] == pytest.approx(sum(both["psnr"]) / 2)
     page = (tmp_path / "tables" / "tables.md").read_text()
     [row] = [line.split(" | ") for line in page.splitlines() if line.startswith("| II |")]
@@ -81,12 +98,19 @@ def test_networks_fill_all_rows_and_all_figures(small, room, measured, tmp_path,
     assert row[-2] == "dual tiny, 3 steps, keep 0.1, rmse + 0.05 LPIPS"
     for number in (1, 3, 4, 5):
         target = tmp_path / f"figure{number}.png"
-        figures.main(number, (tmp_path / ("tables" if number == 4 else "hall.ply"),), target, refiners=(trained,))
+        figures.main(
+            number,
+            (tmp_path / ("tables" if number == 4 else "hall.ply"),),
+            target,
+            refiners=(trained,),
+        )
         assert target.read_bytes().startswith(b"\x89PNG") and target.stat().st_size > 10_000
 
 
 def test_a_figure_without_its_network_names_the_command_that_trains_it(room, tmp_path):
-    with pytest.raises(PointSplatError, match="room: PointSplat cannot be drawn: no weights .*ns-train pointsplat"):
+    with pytest.raises(
+        PointSplatError, match="room: PointSplat cannot be drawn: no weights .*ns-train pointsplat"
+    ):
         figures.main(1, (room,), tmp_path / "figure1.png")
 
 

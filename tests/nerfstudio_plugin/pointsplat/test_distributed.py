@@ -1,4 +1,5 @@
-"""Two processes that torchrun starts do what one does with twice the scenes an update. Run as a program: the two."""
+"""Two processes that torchrun starts do what one does with twice the scenes an update. Run as a
+program: the two."""
 
 import os
 import socket
@@ -15,7 +16,15 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from broken_steps import broken
-from making import QUICK_START, REPOSITORY, box_room, dense_config, equal, losses_of, views_sampled_once
+from making import (
+    QUICK_START,
+    REPOSITORY,
+    box_room,
+    dense_config,
+    equal,
+    losses_of,
+    views_sampled_once,
+)
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.settings import changed
@@ -27,49 +36,65 @@ pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all
 
 UPDATES = 2
 BROKEN = {3}, {6}
-"""Places of a broken photo, which the second process meets, and of a broken gradient, which the first does."""
+"""Places of a broken photo, which the second process meets, and of a broken gradient, which the
+first does."""
 
 
 def config_of(data: Path, output_dir: Path, steps: int):
-    """The method at a size for tests, at constant rates, for a schedule counts steps, not scenes."""
+    """The method at a size for tests, at constant rates, for a schedule counts steps, not
+    scenes."""
     config = dense_config(data, output_dir, steps)
-    config.timestamp, config.steps_per_eval_image = "now", 0
-    config.pipeline.datamanager.sampled_poses, config.pipeline.datamanager.sampled_size = 5, (32, 24)
+    config.timestamp = "now"
+    config.steps_per_eval_image = 0
+    config.pipeline.datamanager.sampled_poses = 5
+    config.pipeline.datamanager.sampled_size = (32, 24)
     for group in config.optimizers.values():
-        group["scheduler"], group["optimizer"].lr = ExponentialDecaySchedulerConfig(), 1e-3  # to the same rate
+        # to the same rate
+        group["scheduler"] = ExponentialDecaySchedulerConfig()
+        group["optimizer"].lr = 1e-3
     return config
 
 
 def train(config, judged: bool = False) -> dict:
-    """Losses, gradients of the last update, weights and, if asked for, the evaluation of a training, which is set up as
-    by ``ns-train``."""
+    """Losses, gradients of the last update, weights and, if asked for, the evaluation of a
+    training, which is set up as by ``ns-train``."""
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     losses = losses_of(trainer)
     trainer.train()
     refiner = trainer.pipeline.model.refiner
-    with mock.patch("pointsplat_ns.metrics.lpips.cached_lpips", side_effect=LpipsUnavailable("not in this test")):
+    with mock.patch(
+        "pointsplat_ns.metrics.lpips.cached_lpips", side_effect=LpipsUnavailable("not in this test")
+    ):
         report = trainer.pipeline.get_average_eval_image_metrics() if judged else {"scenes": {}}
     return {
         "losses": losses,
-        "gradients": {name: p.grad.clone() for name, p in refiner.named_parameters() if p.grad is not None},
+        "gradients": {
+            name: p.grad.clone() for name, p in refiner.named_parameters() if p.grad is not None
+        },
         "weights": {name: p.detach().clone() for name, p in refiner.named_parameters()},
         "report": {name: block["refined"]["psnr"] for name, block in report["scenes"].items()},
         "skipped": dict(trainer.skipped),
-        "files": sorted(p.name for p in config.get_base_dir().rglob("*") if p.is_file() and "events" not in p.name),
+        "files": sorted(
+            p.name
+            for p in config.get_base_dir().rglob("*")
+            if p.is_file() and "events" not in p.name
+        ),
     }
 
 
 def saving(data: Path, output_dir: Path, steps: int):
     config = config_of(data, output_dir, steps)
-    config.steps_per_save, config.save_only_latest_checkpoint = 2, False
+    config.steps_per_save = 2
+    config.save_only_latest_checkpoint = False
     return config
 
 
 @contextmanager
 def two_scenes_a_step() -> Iterator[None]:
-    """Within, a step of one process takes the scenes of the two processes, and the mean of their losses."""
+    """Within, a step of one process takes the scenes of the two processes, and the mean of their
+    losses."""
     one = PointSplatPipeline.get_train_loss_dict
 
     def both(self, step):
@@ -89,7 +114,8 @@ def work(rank: int, folder: Path, port: str) -> None:
     with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]):
         whole = train(saving(folder / "rooms", folder / f"skipping{rank}", 4))
         rest = saving(folder / "rooms", folder / f"rest{rank}", 1)
-        rest.load_dir, rest.load_step = folder / "skipping0/refiner/pointsplat/now/nerfstudio_models", 2
+        rest.load_dir = folder / "skipping0/refiner/pointsplat/now/nerfstudio_models"
+        rest.load_step = 2
         found["skipping"] = [whole, train(rest)]
     torch.save(found, folder / f"found{rank}.pt")
 
@@ -104,9 +130,14 @@ def together(tmp_path_factory):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = str(server.getsockname()[1])
     pair = subprocess.Popen(
-        [sys.executable, __file__, folder, port], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (QUICK_START, REPOSITORY, QUICK_START.parent)))},
-    )  # fmt: skip
+        [sys.executable, __file__, folder, port],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(map(str, (QUICK_START, REPOSITORY, QUICK_START.parent))),
+        },
+    )
     try:
         with two_scenes_a_step():
             alone = train(config_of(folder / "rooms", folder / "alone", UPDATES), judged=True)
@@ -122,17 +153,24 @@ def together(tmp_path_factory):
 
 
 def differ(found: dict, wanted: dict) -> float:
-    """The largest difference of tensors, as shares of the largest value of each: Adam's first steps have the size of
-    the rate, whatever that of the gradient, so that rounding shows where a gradient is nearly nothing."""
+    """The largest difference of tensors, as shares of the largest value of each: Adam's first steps
+    have the size of the rate, whatever that of the gradient, so that rounding shows where a
+    gradient is nearly nothing."""
     return max(
-        float((found[name] - value).abs().max() / value.abs().max().clamp_min(1e-6)) for name, value in wanted.items()
+        float((found[name] - value).abs().max() / value.abs().max().clamp_min(1e-6))
+        for name, value in wanted.items()
     )
 
 
 def test_two_processes_train_as_one_with_twice_the_batch(together):
     found, alone = together
-    means = [(ours + theirs) / 2 for ours, theirs in zip(found[0]["losses"], found[1]["losses"], strict=True)]
-    assert means == pytest.approx(alone["losses"], rel=1e-5)  # float32 sums in another order, through two updates
+    means = [
+        (ours + theirs) / 2
+        for ours, theirs in zip(found[0]["losses"], found[1]["losses"], strict=True)
+    ]
+    assert means == pytest.approx(
+        alone["losses"], rel=1e-5
+    )  # float32 sums in another order, through two updates
     assert len(set(alone["losses"])) == UPDATES and len(alone["gradients"]) == len(alone["weights"])
     for key in ("gradients", "weights"):
         assert equal(found[0][key], found[1][key]) and differ(found[0][key], alone[key]) < 1e-3
@@ -141,8 +179,14 @@ def test_two_processes_train_as_one_with_twice_the_batch(together):
 def test_each_process_evaluates_its_share_and_the_first_alone_writes(together):
     found, alone = together
     assert found[0]["report"] == found[1]["report"] and list(found[0]["report"]) == ["a", "b", "c"]
-    assert found[0]["report"] == pytest.approx(alone["report"], abs=1e-2)  # dB, of weights that differ by rounding
-    assert found[0]["files"] == ["config.yml", "refiner.safetensors", f"step-{UPDATES - 1:09d}.ckpt"]
+    assert found[0]["report"] == pytest.approx(
+        alone["report"], abs=1e-2
+    )  # dB, of weights that differ by rounding
+    assert found[0]["files"] == [
+        "config.yml",
+        "refiner.safetensors",
+        f"step-{UPDATES - 1:09d}.ckpt",
+    ]
     assert found[1]["files"] == []
 
 
@@ -169,7 +213,9 @@ def test_what_one_process_cannot_use_all_leave_out(together):
 def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
     config = config_of(tmp_path, tmp_path, 1)
     config.machine.num_devices = 2
-    with pytest.raises(PointSplatError, match="torchrun --nproc-per-node 2 --no-python ns-train pointsplat"):
+    with pytest.raises(
+        PointSplatError, match="torchrun --nproc-per-node 2 --no-python ns-train pointsplat"
+    ):
         config.set_timestamp()
     with pytest.raises(SceneError, match="2 processes are asked for and 1 are connected"):
         config.pipeline.setup(device="cpu", test_mode="val", world_size=2)

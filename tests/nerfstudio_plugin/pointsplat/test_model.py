@@ -1,4 +1,5 @@
-"""The model: its settings, losses and evaluation, and what nerfstudio's viewer and exporters get of it."""
+"""The model: its settings, losses and evaluation, and what nerfstudio's viewer and exporters get of
+it."""
 
 import copy
 import json
@@ -46,14 +47,20 @@ def test_a_scene_is_drawn_as_it_was_trained(trained_walls):
     with mock.patch(place, side_effect=rasterization) as drawn, torch.no_grad():
         for index in (0, 1):
             pipeline.model.losses(index, [pipeline.datamanager.scenes[index].frames("test")[0]])
-    modes = [(call.kwargs["rasterize_mode"], call.kwargs["sh_degree"]) for call in drawn.call_args_list]
+    modes = [
+        (call.kwargs["rasterize_mode"], call.kwargs["sh_degree"]) for call in drawn.call_args_list
+    ]
     assert modes == [("classic", 3), ("antialiased", 1)]
 
 
 @pytest.mark.parametrize("other", [{"size": "small"}, {"norm": "batch"}], ids=str)
 def test_weights_of_another_network_are_refused(trained, trained_walls, other):
-    state = torch.load(next(trained[0].get_checkpoint_dir().iterdir()), weights_only=True)["pipeline"]
-    with pytest.raises(SceneError, match="does not hold a network of size .* with encoder .*, use_appearance"):
+    state = torch.load(next(trained[0].get_checkpoint_dir().iterdir()), weights_only=True)[
+        "pipeline"
+    ]
+    with pytest.raises(
+        SceneError, match="does not hold a network of size .* with encoder .*, use_appearance"
+    ):
         pipeline_of(trained_walls, **other).load_pipeline(state, 9)
 
 
@@ -71,14 +78,20 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
     frame = pipeline.datamanager.scenes[0].frames("test")[0]
     _, losses, _ = pipeline.model.losses(0, [frame])
     sum(losses.values()).backward()
-    assert all(p.grad.isfinite().all() for p in pipeline.model.refiner.parameters() if p.grad is not None)
+    assert all(
+        p.grad.isfinite().all() for p in pipeline.model.refiner.parameters() if p.grad is not None
+    )
     if not some_lpips:
         assert set(losses) == {"l1"} and "no network" in pipeline.model.no_lpips_reason
         return
     with torch.no_grad():
-        outputs = pipeline.model.draw(pipeline.model.pruned_scene(0).pruned, pipeline.datamanager.scenes[0], frame[0])
+        outputs = pipeline.model.draw(
+            pipeline.model.pruned_scene(0).pruned, pipeline.datamanager.scenes[0], frame[0]
+        )
         expected = 0.1 * load_lpips("alex")(outputs["rgb"], frame[1]["image"] / 255)
-    assert float(losses["lpips"]) == pytest.approx(float(expected), rel=1e-4)  # float32 sums in another order
+    assert float(losses["lpips"]) == pytest.approx(
+        float(expected), rel=1e-4
+    )  # float32 sums in another order
     assert not any("lpips" in name for name in pipeline.state_dict())
 
 
@@ -87,7 +100,10 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
     [
         ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or above"),
         ({"by": "pup"}, "pup looks at a scene from poses; expected a method that needs none"),
-        ({"encoder": "concat", "use_position": False}, "switches of the encoder 'dual'; encoder 'concat' expects both"),
+        (
+            {"encoder": "concat", "use_position": False},
+            "switches of the encoder 'dual'; encoder 'concat' expects both",
+        ),
         ({"keep": 0.0}, "keep is .*expected a ratio above 0"),
         ({"more_keeps": (0.3, 1.5)}, "keep is 1.5"),
         ({"schedule": "step", "drop_at": 0.0}, "--drop-at 0"),
@@ -118,7 +134,9 @@ def test_a_scene_that_was_trained_again_counts_as_unseen(trained, trained_walls,
         seen = [scene.identity in pipeline.trained_on for scene in pipeline.datamanager.scenes]
         assert seen == wanted, f"a run is the same wherever its folder is; trained anew: {change!r}"
         text = (again / "config.yml").read_text()
-        (again / "config.yml").write_text(text.replace(open_run(again).timestamp, "2031-01-01_000000"))
+        (again / "config.yml").write_text(
+            text.replace(open_run(again).timestamp, "2031-01-01_000000")
+        )
 
 
 @pytest.fixture(scope="module")
@@ -140,11 +158,20 @@ def test_the_printed_table_has_each_scene_and_mean(report, capsys):
     shown = capsys.readouterr().out
     assert "keep 0.5, by paper, refiner tiny; compared with photos" in shown
     assert ("no LPIPS: no weights here" in shown) == ("lpips_note" in found)
-    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in shown.splitlines() if "dense  " in line]
-    blocks = [*found["scenes"].values(), *(found[key] for key in ("average", "average_seen", "average_unseen"))]
+    rows = [
+        [cell.strip() for cell in line.split("│")[1:-1]]
+        for line in shown.splitlines()
+        if "dense  " in line
+    ]
+    blocks = [
+        *found["scenes"].values(),
+        *(found[key] for key in ("average", "average_seen", "average_unseen")),
+    ]
     assert [row[:2] for row in rows] == [
-        ["wall-a", "yes"], ["wall-b", "never"], *(["average", seen] for seen in ("", "yes", "never"))
-    ]  # fmt: skip
+        ["wall-a", "yes"],
+        ["wall-b", "never"],
+        *(["average", seen] for seen in ("", "yes", "never")),
+    ]
     for row, block in zip(rows, blocks, strict=True):
         dense = block["dense"]
         assert row[2:5] == ["dense", f"{dense['psnr']:.2f}", f"{dense['ssim']:.3f}"]
@@ -154,37 +181,59 @@ def test_the_printed_table_has_each_scene_and_mean(report, capsys):
 def test_a_report_has_sizes_quality_and_speed_of_each_scene(evaluated, report):
     found, folder = report
     for index, (name, seen) in enumerate((("wall-a", True), ("wall-b", False))):
-        scene, block = evaluated.model.pruned_scene(index), found["scenes"][name]
+        scene = evaluated.model.pruned_scene(index)
+        block = found["scenes"][name]
         assert (block["views"], block["seen_in_training"]) == (2, seen)
         assert block["dense"]["gaussians"] == len(evaluated.datamanager.scenes[index].read_dense())
         assert block["pruned"]["gaussians"] == block["refined"]["gaussians"] == len(scene.pruned)
         assert block["pruned"]["megabytes"] == pytest.approx(scene.pruned.megabytes)
         assert all(block[v]["fps"] > 0 and 0 < block[v]["ssim"] <= 1 for v in VARIANTS)
-        assert block["dense"]["psnr"] > block["pruned"]["psnr"], "half the Gaussians of a wall leave holes"
+        assert block["dense"]["psnr"] > block["pruned"]["psnr"], (
+            "half the Gaussians of a wall leave holes"
+        )
         values = [block[variant]["lpips"] for variant in VARIANTS]
         if LPIPS_WEIGHTS.exists():
             assert all(0 < value < 2 for value in values) and "lpips_note" not in found
         else:
             assert values == [None] * 3 and found["lpips_note"] == "no weights here"
     seen, unseen = (found["scenes"][name]["refined"]["psnr"] for name in ("wall-a", "wall-b"))
-    means = {key: found[key]["refined"]["psnr"] for key in ("average", "average_seen", "average_unseen")}
-    assert means == {"average": pytest.approx((seen + unseen) / 2), "average_seen": seen, "average_unseen": unseen}
+    means = {
+        key: found[key]["refined"]["psnr"] for key in ("average", "average_seen", "average_unseen")
+    }
+    assert means == {
+        "average": pytest.approx((seen + unseen) / 2),
+        "average_seen": seen,
+        "average_unseen": unseen,
+    }
     assert found["psnr"] == unseen and found["psnr_std"] > 0
-    network = {"size": "tiny", "encoder": "dual", "use_appearance": True, "use_position": True, "norm": "scene"}
+    network = {
+        "size": "tiny",
+        "encoder": "dual",
+        "use_appearance": True,
+        "use_position": True,
+        "norm": "scene",
+    }
     network |= {"stem": "conv", "raw_inputs": False, "means_reach": 0.05}
     assert found["settings"] == {**network, "keep": 0.5, "by": "paper", "opacity_weight": None}
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert not evaluated.training and not evaluated.model.training, "the model is left as it was"
-    assert sorted(path.name for path in folder.iterdir()) == [f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)]
-    assert cv2.imread(str(folder / "wall-a_0000.png")).shape == (48, 4 * 64, 3), "photo, dense, pruned, refined"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)
+    ]
+    assert cv2.imread(str(folder / "wall-a_0000.png")).shape == (48, 4 * 64, 3), (
+        "photo, dense, pruned, refined"
+    )
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0])
 @pytest.mark.parametrize("name", sorted(PIXEL_LOSSES))
 def test_pixel_losses_at_extremes(name, scale):
-    """Value and gradient in float32 against float64; nothing differs, next to nothing differs, everything differs."""
+    """Value and gradient in float32 against float64; nothing differs, next to nothing differs,
+    everything differs."""
     signs = scale * torch.tensor([1.0, -1.0, 0.5]).repeat(16).reshape(4, 4, 3)
-    found, exact = (signs.to(dtype, copy=True).requires_grad_() for dtype in (torch.float32, torch.float64))
+    found, exact = (
+        signs.to(dtype, copy=True).requires_grad_() for dtype in (torch.float32, torch.float64)
+    )
     values = [PIXEL_LOSSES[name](found), PIXEL_LOSSES[name](exact)]
     gradients = torch.autograd.grad(values, [found, exact])
     assert values[0].item() == pytest.approx(values[1].item(), rel=1e-5, abs=1e-9)
@@ -197,34 +246,56 @@ def test_the_viewer_gets_what_it_reads_of_a_splatfacto_model(evaluated, trained_
     camera, _ = evaluated.datamanager.scenes[1].frames("test")[0]
     outputs = model.get_outputs_for_camera(camera)
     sizes = {name: tuple(value.shape) for name, value in outputs.items()}
-    assert sizes == {"rgb": (48, 64, 3), "depth": (48, 64, 1), "accumulation": (48, 64, 1), "background": (48, 64, 3)}
+    assert sizes == {
+        "rgb": (48, 64, 3),
+        "depth": (48, 64, 1),
+        "accumulation": (48, 64, 1),
+        "background": (48, 64, 3),
+    }
     assert all(value.isfinite().all() and not value.requires_grad for value in outputs.values())
     assert outputs["accumulation"].max() > 0.5
-    assert set(model.gauss_params) == set(PARAMETERS) and model.num_points == len(model.pruned_scene(1).pruned)
+    assert set(model.gauss_params) == set(PARAMETERS) and model.num_points == len(
+        model.pruned_scene(1).pruned
+    )
     assert torch.equal(model.shs_rest, model.gauss_params["features_rest"])
     assert torch.equal(model.shs_0, model.gauss_params["features_dc"])
     assert model.colors.shape == (model.num_points, 3)
-    assert len(evaluated.datamanager.train_dataset) == 9 and len(evaluated.datamanager.eval_dataset) == 2
+    assert (
+        len(evaluated.datamanager.train_dataset) == 9
+        and len(evaluated.datamanager.eval_dataset) == 2
+    )
     half = OrientedBox.from_params((-50.0, 0.0, 0.0), (0.0, 0.0, 0.0), (100.0, 100.0, 100.0))
     inside = model.gaussians[model.gaussians.means[:, 0] < 0]
     expected = model.draw(inside, evaluated.datamanager.scenes[1], camera)
-    torch.testing.assert_close(model.get_outputs_for_camera(camera, obb_box=half)["rgb"], expected["rgb"])
+    torch.testing.assert_close(
+        model.get_outputs_for_camera(camera, obb_box=half)["rgb"], expected["rgb"]
+    )
     far = OrientedBox.from_params((900.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    assert model.get_outputs_for_camera(camera, obb_box=far)["rgb"].eq(1).all(), "wall-b was trained over white"
-    assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], outputs["rgb"]), "the crop box does not stay"
+    assert model.get_outputs_for_camera(camera, obb_box=far)["rgb"].eq(1).all(), (
+        "wall-b was trained over white"
+    )
+    assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], outputs["rgb"]), (
+        "the crop box does not stay"
+    )
 
 
-def test_both_exporters_write_the_refined_scene_with_the_photos_gone(trained, trained_walls, wall_scene, tmp_path):
+def test_both_exporters_write_the_refined_scene_with_the_photos_gone(
+    trained, trained_walls, wall_scene, tmp_path
+):
     config, trainer = trained
     expected = trainer.pipeline.eval().model.gaussians
-    photos, hidden = wall_scene, wall_scene.with_name("hidden")
+    photos = wall_scene
+    hidden = wall_scene.with_name("hidden")
     photos.rename(hidden)
     try:
-        ExportGaussianSplat(load_config=config.get_base_dir() / "config.yml", output_dir=tmp_path).main()
+        ExportGaussianSplat(
+            load_config=config.get_base_dir() / "config.yml", output_dir=tmp_path
+        ).main()
         export(config.get_base_dir(), tmp_path / "ours.ply")
     finally:
         hidden.rename(photos)
-    theirs, ours = read_ply(tmp_path / "splat.ply"), read_ply(tmp_path / "ours.ply")
+    theirs = read_ply(tmp_path / "splat.ply")
+    ours = read_ply(tmp_path / "ours.ply")
     assert same(ours, expected)
     drawn = expected[expected.opacities[:, 0] >= -5.5373]  # ns-export drops opacities below 1/255
     assert len(drawn) > 0 and same(theirs, drawn)

@@ -1,4 +1,5 @@
-"""The methods pointsplat-paper and pointsplat-authors against their sources, and trained for two steps."""
+"""The methods pointsplat-paper and pointsplat-authors against their sources, and trained for two
+steps."""
 
 from functools import reduce
 from unittest import mock
@@ -51,16 +52,26 @@ def test_each_field_of_a_preset_is_that_of_its_source(name, column):
     assert found == {path: values[column] for path, values in FIELDS.items()}
     trainer = config.setup(local_rank=0, world_size=1)  # applies rates
     optimizers = {part: group["optimizer"] for part, group in trainer.config.optimizers.items()}
-    assert {part: optimizer.lr for part, optimizer in optimizers.items()} == {p: v[column] for p, v in BY_PART.items()}
-    assert {(o.eps, o.max_norm, o.weight_decay) for o in optimizers.values()} == {((1e-8, 1e-15)[column], None, 0)}
+    assert {part: optimizer.lr for part, optimizer in optimizers.items()} == {
+        p: v[column] for p, v in BY_PART.items()
+    }
+    assert {(o.eps, o.max_norm, o.weight_decay) for o in optimizers.values()} == {
+        ((1e-8, 1e-15)[column], None, 0)
+    }
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_trains_and_its_run_and_weights_open_again(trained_walls, run_training, tmp_path, no_lpips, name):
+def test_a_preset_trains_and_its_run_and_weights_open_again(
+    trained_walls, run_training, tmp_path, no_lpips, name
+):
     config = PRESETS[name]()
-    config.machine.device_type, config.output_dir, config.max_num_iterations = "cpu", tmp_path, 2
-    config.experiment_name, config.pipeline.datamanager.data = "refiner", trained_walls
-    config.pipeline.model.size, config.pipeline.model.enc_depths = "tiny", None if name == "paper" else (1, 2, 1)
+    config.machine.device_type = "cpu"
+    config.output_dir = tmp_path
+    config.max_num_iterations = 2
+    config.experiment_name = "refiner"
+    config.pipeline.datamanager.data = trained_walls
+    config.pipeline.model.size = "tiny"
+    config.pipeline.model.enc_depths = None if name == "paper" else (1, 2, 1)
     config.set_timestamp()
     started = []
     build = Refiner.__init__
@@ -74,22 +85,37 @@ def test_a_preset_trains_and_its_run_and_weights_open_again(trained_walls, run_t
     refiner = trainer.pipeline.model.refiner
     assert len(losses) == 2 and not trainer.skipped
     assert "vgg" in trainer.pipeline.model.no_lpips_reason.lower(), "it says that LPIPS is left out"
-    moved = {key.split(".")[0] for key, value in refiner.named_parameters() if not torch.equal(value, started[0][key])}
+    moved = {
+        key.split(".")[0]
+        for key, value in refiner.named_parameters()
+        if not torch.equal(value, started[0][key])
+    }
     assert moved == ({"encoder"} if name == "paper" else set()) | {"backbone", "heads"}
     untrained = [key for key, value in refiner.named_parameters() if value.grad is None]
-    assert all(key.startswith("encoder.") for key in untrained) and bool(untrained) == (name == "authors")
-    assert set(BY_PART) - set(trainer.optimizers.optimizers) == (set() if name == "paper" else {"encoder"})
-    trainer.config.max_num_iterations, drop = 10_000, {"paper": 6000, "authors": 7000}[name]
+    assert all(key.startswith("encoder.") for key in untrained) and bool(untrained) == (
+        name == "authors"
+    )
+    assert set(BY_PART) - set(trainer.optimizers.optimizers) == (
+        set() if name == "paper" else {"encoder"}
+    )
+    trainer.config.max_num_iterations = 10_000
+    drop = {"paper": 6000, "authors": 7000}[name]
     factor = trainer.optimizers.schedulers["means"].lr_lambdas[0]
     assert [factor(step) for step in (0, drop - 1, drop, 9999)] == [1.0, 1.0, 0.1, 0.1]
     assert config.get_base_dir().parts[-2] == f"pointsplat-{name}"
     with mock.patch.dict(all_methods, {config.method_name: PRESETS[name]()}):
         again = eval_setup(config.get_base_dir() / "config.yml")[1]
     weights = config.get_base_dir() / RUN_FILES.refiner
-    for opened in (load_refiner(config.get_base_dir()).network, load_refiner(weights).network, again.model.refiner):
+    for opened in (
+        load_refiner(config.get_base_dir()).network,
+        load_refiner(weights).network,
+        again.model.refiner,
+    ):
         assert opened.config == refiner.config and equal(opened.state_dict(), refiner.state_dict())
     about = read_metadata(weights)
-    assert all(about[key] == getattr(config, key) for key in ("method_name", "drop_at", "global_norm"))
+    assert all(
+        about[key] == getattr(config, key) for key in ("method_name", "drop_at", "global_norm")
+    )
     assert about["train_encoder"] == (name == "paper")
 
 
@@ -105,4 +131,6 @@ def test_one_norm_limits_all_gradients_together(trained_walls, tmp_path):
     total = torch.cat([p.grad.flatten() for p in parameters]).norm()
     trainer.update(0, skipped=False)
     for number, parameter in enumerate(parameters):
-        torch.testing.assert_close(parameter.grad, torch.full_like(parameter, number * 1e-3 / total), rtol=1e-3, atol=0)
+        torch.testing.assert_close(
+            parameter.grad, torch.full_like(parameter, number * 1e-3 / total), rtol=1e-3, atol=0
+        )

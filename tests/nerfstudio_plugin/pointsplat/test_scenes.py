@@ -1,4 +1,5 @@
-"""The scenes of a training: runs, and dense scenes as their own references; and what a step gets."""
+"""The scenes of a training: runs, and dense scenes as their own references; and what a step
+gets."""
 
 import json
 import os
@@ -26,7 +27,9 @@ from pointsplat_ns.views import EPS2D, Views
 
 
 def manager_of(folder: Path, **settings):
-    return ScenesDataManagerConfig(data=folder, cache_gigabytes=0.01, **settings).setup(test_mode="val")
+    return ScenesDataManagerConfig(data=folder, cache_gigabytes=0.01, **settings).setup(
+        test_mode="val"
+    )
 
 
 @pytest.fixture
@@ -57,38 +60,55 @@ def test_what_cannot_be_a_scene_says_what_is_wrong(trained_walls, tmp_path):
 
 
 def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(run):
-    config, text = run / "config.yml", (run / "config.yml").read_text()
+    config = run / "config.yml"
+    text = (run / "config.yml").read_text()
     parser = "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig"
     config.write_text(text.replace(parser, "json.JSONDecoder"))
-    with pytest.raises(SceneError, match="config.yml: trained with the dataparser json.JSONDecoder.*not installed"):
+    with pytest.raises(
+        SceneError, match="config.yml: trained with the dataparser json.JSONDecoder.*not installed"
+    ):
         dataparser_of(open_run(run))
-    config.write_text(text.replace("frame_stride: 1", "frame_stride: 1\n      an_option_of_then: null"))
-    assert dataparser_of(open_run(run)).config.frame_stride == 1, "what was not given need not exist any more"
+    config.write_text(
+        text.replace("frame_stride: 1", "frame_stride: 1\n      an_option_of_then: null")
+    )
+    assert dataparser_of(open_run(run)).config.frame_stride == 1, (
+        "what was not given need not exist any more"
+    )
     config.write_text(text.replace("frame_stride:", "frame_leap:"))
     with mock.patch("pointsplat_ns.nerfstudio_plugin.pointsplat.scenes.CONSOLE.log") as log:
         assert dataparser_of(open_run(run)).config.frame_stride == 1
-    assert log.call_args.args[0].endswith("settings that its dataparser no longer has are left out: frame_leap")
+    assert log.call_args.args[0].endswith(
+        "settings that its dataparser no longer has are left out: frame_leap"
+    )
 
 
 def test_code_in_a_config_is_never_run(run):
     config = run / "config.yml"
-    text = config.read_text().replace("frame_stride: 1", "frame_stride: !!python/object/apply:os.system ['true']")
+    text = config.read_text().replace(
+        "frame_stride: 1", "frame_stride: !!python/object/apply:os.system ['true']"
+    )
     config.write_text(text)
     assert "os.system" in text
     with mock.patch.object(os, "system", side_effect=AssertionError("the config was run")):
-        assert len(scene_of(run).frames("train")) == 9, "the default stands where the config holds an object"
+        assert len(scene_of(run).frames("train")) == 9, (
+            "the default stands where the config holds an object"
+        )
         manager_of(run)
 
 
 def test_poses_in_another_frame_are_refused_in_training_and_in_evaluation(run, wall_scene):
     moved = torch.eye(4)[:3]
     moved[0, 3] = 0.5
-    (run / "dataparser_transforms.json").write_text(json.dumps({"transform": moved.tolist(), "scale": 1.0}))
+    (run / "dataparser_transforms.json").write_text(
+        json.dumps({"transform": moved.tolist(), "scale": 1.0})
+    )
     for split in ("train", "test"):
         with pytest.raises(DataError, match="no longer in the frame.*differs by 0.5") as caught:
             scene_of(run).frames(split)
         assert str(wall_scene) in str(caught.value) and "\n" not in str(caught.value)
-    (run / "dataparser_transforms.json").write_text(json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 1.01}))
+    (run / "dataparser_transforms.json").write_text(
+        json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 1.01})
+    )
     with pytest.raises(DataError, match="the scale is 1 and was 1.01"):
         _ = scene_of(run).frames("train")
 
@@ -105,7 +125,9 @@ def test_a_step_depends_on_its_number_alone_and_processes_share_it(trained_walls
     assert alone != [photos_of(other, step) for step in range(12)]
     config = ScenesDataManagerConfig(data=trained_walls, cache_gigabytes=0.01)
     for size in (2, 3):
-        shares = [config.setup(test_mode="val", world_size=size, local_rank=rank) for rank in range(size)]
+        shares = [
+            config.setup(test_mode="val", world_size=size, local_rank=rank) for rank in range(size)
+        ]
         together = [photos_of(share, step) for step in range(12 // size) for share in shares]
         assert together == alone
 
@@ -115,12 +137,15 @@ POSES = ScenesDataManagerConfig(sampled_poses=6, sampled_size=(32, 24), seed=1)
 
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory) -> Path:
-    """A folder of two PLY rooms, one in a folder of its own, beside a point cloud that is no scene."""
+    """A folder of two PLY rooms, one in a folder of its own, beside a point cloud that is no
+    scene."""
     folder = tmp_path_factory.mktemp("rooms")
     write_ply(box_room(1), folder / "one.ply")
     (folder / "deep" / "iteration_7").mkdir(parents=True)
     write_ply(box_room(2), folder / "deep" / "iteration_7" / "point_cloud.ply")
-    (folder / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    (folder / "cloud.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+    )
     (folder / "broken.ply").write_text("nothing")
     return folder
 
@@ -153,7 +178,9 @@ def test_what_holds_no_scene_says_so(rooms, tmp_path):
 def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms, monkeypatch):
     monkeypatch.setattr(dense_scenes, "sample_views", sample_views)  # anew for each
     scene = dense_scene(rooms)
-    train, held_out = (scene.frames(split).dataset.cameras.camera_to_worlds for split in ("train", "test"))
+    train, held_out = (
+        scene.frames(split).dataset.cameras.camera_to_worlds for split in ("train", "test")
+    )
     assert len(train) == 6 and len(held_out) == 1
     assert torch.equal(dense_scene(rooms).cameras("train").camera_to_worlds, train)
     assert torch.cdist(train.reshape(-1, 12), held_out.reshape(-1, 12)).min() > 1e-3
@@ -162,17 +189,32 @@ def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms, 
 def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
     scene = dense_scene(rooms)
     assert not scene.dense(keep=False).means.requires_grad
-    for frames, tolerance in ((scene.rendered["train"], 0.5 / 255 + 1e-6), (scene.rendered["test"], 1e-6)):
+    for frames, tolerance in (
+        (scene.rendered["train"], 0.5 / 255 + 1e-6),
+        (scene.rendered["test"], 1e-6),
+    ):
         camera, data = frames[-1]
-        poses, Ks = viewmats_from_opengl(camera.camera_to_worlds), camera.get_intrinsics_matrices()
+        poses = viewmats_from_opengl(camera.camera_to_worlds)
+        Ks = camera.get_intrinsics_matrices()
         views = Views(poses, Ks, 32, 24, scene.background, **carried(camera))
         image = data["image"].float() / (255 if data["image"].dtype == torch.uint8 else 1)
         # half a level where they are rounded, float32 noise where they are not
-        torch.testing.assert_close(image, render(scene.read_dense(), views[0]), atol=tolerance, rtol=0)
-        assert data["image_idx"] == len(frames) - 1 and image.std() > 0.05 and not data["image"].requires_grad
+        torch.testing.assert_close(
+            image, render(scene.read_dense(), views[0]), atol=tolerance, rtol=0
+        )
+        assert (
+            data["image_idx"] == len(frames) - 1
+            and image.std() > 0.05
+            and not data["image"].requires_grad
+        )
     image = scene.rendered["train"][0][1]["image"]
     assert image.dtype == torch.uint8
-    assert torch.equal(scene.rendered["train"].dataset[0]["image"], image / 255), "what the viewer shows"
+    assert torch.equal(scene.rendered["train"].dataset[0]["image"], image / 255), (
+        "what the viewer shows"
+    )
     # Every second training picture is subsampled from one of the size that people look at.
-    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered["train"]] == 3 * [EPS2D, EPS2D * (32 / 1920) ** 2]
+    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered["train"]] == 3 * [
+        EPS2D,
+        EPS2D * (32 / 1920) ** 2,
+    ]
     assert [carried(camera)["eps2d"] for camera, _ in scene.rendered["test"]] == [EPS2D]

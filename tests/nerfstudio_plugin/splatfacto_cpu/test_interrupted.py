@@ -16,7 +16,10 @@ from broken_steps import broken
 from making import equal, small_config
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io import open_run, read_scene
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer, splatfacto_cpu_config
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import (
+    SplatfactoCpuTrainer,
+    splatfacto_cpu_config,
+)
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import takes_tiny_as_zero
 
@@ -56,10 +59,15 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
     run = open_run(config.get_base_dir())
     assert run.step == 10 and "Saved after step 10" in said.out
     scene = read_scene(run.folder)
-    assert len({len(value) for value in scene.tensors()}) == 1 and scene.usable().all() and len(scene) > 100
+    assert (
+        len({len(value) for value in scene.tensors()}) == 1
+        and scene.usable().all()
+        and len(scene) > 100
+    )
     again = wall_config(wall_scene, tmp_path, steps=3)
     # In the same second it would have the same folder.
-    again.load_dir, again.timestamp = config.get_checkpoint_dir(), "2031-01-01_000000"
+    again.load_dir = config.get_checkpoint_dir()
+    again.timestamp = "2031-01-01_000000"
     trainer, _ = run_training(again)
     assert trainer._start_step == 11 and trainer.step == 13
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
@@ -68,7 +76,9 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
 def test_ctrl_c_before_the_first_step_ends_the_command_as_interrupted(monkeypatch, capsys):
     def main(**_):
         trainer = object.__new__(SplatfactoCpuTrainer)
-        trainer.config, trainer.device, trainer.world_size = splatfacto_cpu_config(), "cpu", 1
+        trainer.config = splatfacto_cpu_config()
+        trainer.device = "cpu"
+        trainer.world_size = 1
         trainer.setup()
 
     monkeypatch.setattr(Trainer, "setup", mock.Mock(side_effect=KeyboardInterrupt))
@@ -93,24 +103,37 @@ def test_a_second_or_early_signal_ends_it_at_once_and_saves_nothing(
 
 @pytest.mark.parametrize("number", [0, -3])
 def test_no_steps_are_refused_and_leave_no_folder(number, wall_scene, wall_config, tmp_path):
-    for config in (wall_config(wall_scene, tmp_path / "scene", 2), small_config(wall_scene, tmp_path / "refiner", 2)):
-        config.max_num_iterations, config.load_dir = number, tmp_path / "checkpoints"
-        with pytest.raises(PointSplatError, match=f"--max-num-iterations {number}: expected at least 1"):
+    for config in (
+        wall_config(wall_scene, tmp_path / "scene", 2),
+        small_config(wall_scene, tmp_path / "refiner", 2),
+    ):
+        config.max_num_iterations = number
+        config.load_dir = tmp_path / "checkpoints"
+        with pytest.raises(
+            PointSplatError, match=f"--max-num-iterations {number}: expected at least 1"
+        ):
             config.save_config()
         assert not config.output_dir.exists()
 
 
 def state_of(trainer):
-    moments, model = trainer.optimizers.optimizers, trainer.pipeline.model
-    state = {"moments": {name: optimizer.state_dict()["state"] for name, optimizer in moments.items()}}
-    return copy.deepcopy({**state, "parameters": model.state_dict(), "gathered": dict(model.strategy_state)})
+    moments = trainer.optimizers.optimizers
+    model = trainer.pipeline.model
+    state = {
+        "moments": {name: optimizer.state_dict()["state"] for name, optimizer in moments.items()}
+    }
+    return copy.deepcopy(
+        {**state, "parameters": model.state_dict(), "gathered": dict(model.strategy_state)}
+    )
 
 
 @pytest.fixture()
 def started(wall_scene, wall_config, tmp_path):
     torch.manual_seed(0)
     config = wall_config(wall_scene, tmp_path, 20)
-    config.pipeline.model.warmup_length = 2  # densification in the eleventh step, before schedules are fitted
+    config.pipeline.model.warmup_length = (
+        2  # densification in the eleventh step, before schedules are fitted
+    )
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     return trainer
@@ -129,20 +152,35 @@ def take(trainer, steps) -> list[dict]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"), [("nan", "the loss main_loss is nan"), ("gradient", "the gradient of the scales is not finite")]
+    ("kind", "said"),
+    [
+        ("nan", "the loss main_loss is nan"),
+        ("gradient", "the gradient of the scales is not finite"),
+    ],
 )
 def test_a_step_that_is_not_finite_changes_nothing_and_is_named(started, kind, said):
     take(started, range(2))
     before = state_of(started)
     assert before["gathered"]["count"].any(), "densification has gathered something"
-    with broken(kind, range(2, 3)), mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log:
+    with (
+        broken(kind, range(2, 3)),
+        mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log,
+    ):
         (metrics,) = take(started, [2])
     assert equal(state_of(started), before)
     photo = started.pipeline.datamanager.latest_photo
-    assert started.skipped == {photo: 1} and metrics["skipped_steps"] == 1 and photo.endswith((".png", ".jpg"))
-    assert [call.args[0] for call in log.call_args_list] == [f"step 2 is skipped: {photo}: {said} (said once for each)"]
+    assert (
+        started.skipped == {photo: 1}
+        and metrics["skipped_steps"] == 1
+        and photo.endswith((".png", ".jpg"))
+    )
+    assert [call.args[0] for call in log.call_args_list] == [
+        f"step 2 is skipped: {photo}: {said} (said once for each)"
+    ]
     (metrics,) = take(started, [3])  # a sound one
-    assert metrics["skipped_steps"] == 1 and not equal(state_of(started)["parameters"], before["parameters"])
+    assert metrics["skipped_steps"] == 1 and not equal(
+        state_of(started)["parameters"], before["parameters"]
+    )
 
 
 def test_many_broken_steps_in_a_row_stop_a_training_and_few_do_not(
@@ -161,7 +199,8 @@ def test_many_broken_steps_in_a_row_stop_a_training_and_few_do_not(
 
 
 def test_a_training_and_its_threads_alone_take_tiny_numbers_as_zero(started, monkeypatch):
-    found, losses_of = [], SplatfactoCpuModel.get_loss_dict
+    found = []
+    losses_of = SplatfactoCpuModel.get_loss_dict
 
     def losses(self, *args, **kwargs):
         thread = threading.Thread(target=lambda: found.append(takes_tiny_as_zero()))
