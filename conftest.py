@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import pytest
 
 from lab.rooms import light
-from pointsplat_ns import view_source
-from pointsplat_ns.compression import repair
-from pointsplat_ns.looking.settings import changed
+from pointsplat_ns.pipeline import repair
+from pointsplat_ns.pipeline import view_provider as view_source
+from pointsplat_ns.view_sampling.settings import changed
 from quick_looking import QUICK, USUAL
 
 

@@ -20,21 +20,21 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.comparing.sizes import RESOLUTION, middle_sized, several_sizes
-from pointsplat_ns.compression.feedback import REPAIR, Feedback
-from pointsplat_ns.compression.optimiser import gradients_of
-from pointsplat_ns.compression.repair import initial_rate_factor, rate_factor
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.pruning import prune
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
+from pointsplat_ns.pipeline.feedback_features import REPAIR, Feedback
+from pointsplat_ns.pipeline.optimiser import gradients_of
+from pointsplat_ns.pipeline.repair import initial_rate_factor, rate_factor
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
+from pointsplat_ns.prune import prune
+from pointsplat_ns.refine.feedback import FeedbackRefiner, save_feedback_refiner
+from pointsplat_ns.render import render
+from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.render.comparison.sizes import RESOLUTION, middle_sized, several_sizes
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.threads import one_thread_each
-from pointsplat_ns.view_source import VIEW_COUNTS
-from pointsplat_ns.views import View, Views
+from pointsplat_ns.view_sampling.sampler import sample_views
 
 
 @dataclass(frozen=True)

@@ -8,27 +8,34 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pointsplat_ns.compacting import Looking, Source, compact_source, log, prune_source, read_source
-from pointsplat_ns.compression.compacted import Compacted
-from pointsplat_ns.compression.pictures import plot_views as draw_views
-from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
-from pointsplat_ns.compression.trained_refiner import (
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.pipeline.options import CompactRequest, Effort, PruneRequest, RepairBudget
+from pointsplat_ns.pipeline.report import Compacted
+from pointsplat_ns.pipeline.requests import (
+    Looking,
+    Source,
+    compact_source,
+    log,
+    prune_source,
+    read_source,
+)
+from pointsplat_ns.pipeline.trained_refiner import (
     TrainedRefiner,
     load_refiner,
     open_refiner_run,
     refine,
     scenes_of_run,
 )
-from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.runs import may_be_run, open_run
-from pointsplat_ns.io.scene import read_scene, source_file
-from pointsplat_ns.levels.levels import LevelOutput, Levels, make_levels, parse_levels
-from pointsplat_ns.pruning import Keep
+from pointsplat_ns.prune import Keep
+from pointsplat_ns.scene.formats import format_to_write
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.reading import read_scene, source_file
+from pointsplat_ns.scene.runs import may_be_run, open_run
+from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.views import Views
+from pointsplat_ns.tools.comparison_plots import plot_views as draw_views
+from pointsplat_ns.tools.levels.levels import LevelOutput, Levels, make_levels, parse_levels
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
 """The shipped example scene."""

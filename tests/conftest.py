@@ -14,9 +14,9 @@ import torch
 
 from browser import chromium
 from making import SHARED_DATA, ball, losses_of, small_config
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.views import Views
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.view_sampling.sampler import sample_views
 from replica_scenes import write_frames
 
 SEED = 20
@@ -150,7 +150,7 @@ def some_lpips(request, monkeypatch) -> bool:
 def make_refined_run() -> Callable:
     """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved``
     to every opacity logit and nothing else, and gives its folder."""
-    from pointsplat_ns.refiner import Refiner, preset
+    from pointsplat_ns.refine import Refiner, preset
 
     def make(
         folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model

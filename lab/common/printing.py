@@ -83,7 +83,7 @@ megabytes = number(0, 1e-6)
 
 def save_figure(figure: Figure, path: Path, **options: Any) -> None:
     """Write a picture whole or not at all, in the format that its name says."""
-    from pointsplat_ns.io.files import replacing
+    from pointsplat_ns.system.files import replacing
 
     with replacing(path) as part:
         figure.savefig(part, **{"dpi": 110, "format": path.suffix.lstrip(".") or "png", **options})

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import torch
 
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import open_run, scene_name
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.runs import open_run, scene_name
 
 TUNING = (
     *("apt_bathroom", "bouquet", "pc_flowers", "pc_statue_massa", "plant_pilea", "kettle_pod"),

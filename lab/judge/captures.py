@@ -34,7 +34,7 @@ from plyfile import PlyData, PlyElement
 from lab.common.printing import console, start, table
 from lab.common.scenes import group_of
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import write_json
+from pointsplat_ns.system.files import write_json
 
 Array = NDArray[np.float64]
 

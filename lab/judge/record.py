@@ -25,7 +25,7 @@ from lab.common.results import Row, grouped
 from lab.common.scenes import group_of
 from lab.common.ways import PEER
 from lab.judge.scenes import LPIPS_WIDTH, MEASURES, PHOTOS
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.system.files import replacing
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "record"

@@ -14,11 +14,11 @@ import tyro
 
 import pointsplat_ns as ps
 from lab.common.printing import start
-from pointsplat_ns.compacting import Looking, read_source
-from pointsplat_ns.compression.photo_repair import photo_repair
-from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.requests import PhotoBudget, PruneRequest
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
+from pointsplat_ns.pipeline.options import PhotoBudget, PruneRequest
+from pointsplat_ns.pipeline.photo_repair import photo_repair
+from pointsplat_ns.pipeline.prune import prune_scene
+from pointsplat_ns.pipeline.requests import Looking, read_source
 
 
 @dataclass(frozen=True)

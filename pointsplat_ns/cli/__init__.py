@@ -139,7 +139,7 @@ def _what_failed(error: Exception) -> str:
         return f"{error.name} is not installed; pip install pointsplat-ns adds what is missing"
     if isinstance(error, ImportError):
         return f"{error}; torch takes 4 GB of address space (ulimit -v)"
-    from pointsplat_ns.io.files import one_line  # which imports torch
+    from pointsplat_ns.system.files import one_line  # which imports torch
 
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror

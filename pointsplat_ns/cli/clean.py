@@ -32,8 +32,8 @@ def clean(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.compacting import Looking, clean_source
-    from pointsplat_ns.compression.quality import judge_of, quality_of_file
+    from pointsplat_ns.pipeline.quality import judge_of, quality_of_file
+    from pointsplat_ns.pipeline.requests import Looking, clean_source
 
     options.need_one_scene(scene)
     options.check_poses(poses)

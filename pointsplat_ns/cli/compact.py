@@ -21,8 +21,8 @@ from pointsplat_ns.cli.printing import (
 )
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.quality import Quality
-    from pointsplat_ns.folders import SceneResult
+    from pointsplat_ns.pipeline.quality import Quality
+    from pointsplat_ns.tools.folders import SceneResult
 
 GoalName = Literal["web", "phone", "headset", "email"]
 
@@ -130,13 +130,13 @@ def compact(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.io.scene import is_folder_of_scenes
+    from pointsplat_ns.scene.reading import is_folder_of_scenes
 
     chosen = GOALS[goal]
     unasked = goal is None and keep is None and refiner is None and target_db is None
     keep = chosen.keep if keep is None and target_db is None else keep
     if is_folder_of_scenes(scene):
-        from pointsplat_ns.folders import output_folder
+        from pointsplat_ns.tools.folders import output_folder
 
         for name, given in {"--poses": poses, "--up": up, "--photos": photos}.items():
             if given is not None and given is not False:
@@ -167,11 +167,11 @@ def compact(
         )
     if jobs is not None:
         raise ps.SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
-    from pointsplat_ns.compacting import Looking, compact_source
-    from pointsplat_ns.compression.quality import judge_of, quality_of_file
-    from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
-    from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.io.runs import name_of
+    from pointsplat_ns.pipeline.options import CompactRequest, RepairBudget
+    from pointsplat_ns.pipeline.quality import judge_of, quality_of_file
+    from pointsplat_ns.pipeline.requests import Looking, compact_source
+    from pointsplat_ns.scene.formats import format_to_write
+    from pointsplat_ns.scene.runs import name_of
 
     options.check_poses(poses)
     if (
@@ -254,7 +254,7 @@ def _print_folder(
     """Print a table of the scenes of a folder, or JSON. Raises PointSplatError if one has
     failed."""
     from pointsplat_ns.errors import PointSplatError
-    from pointsplat_ns.io.discovery import FOLDER_FILES
+    from pointsplat_ns.scene.discovery import FOLDER_FILES
     from pointsplat_ns.system.terminal import print_table
 
     failed = sum(result.status == "failed" for result in results)
@@ -289,8 +289,8 @@ def _print_folder(
 
 def _file_text(path: Path) -> str:
     """Name and size of a scene's file or SOG folder; the name alone of a run."""
-    from pointsplat_ns.io.formats import SOG_META
-    from pointsplat_ns.io.runs import name_of
+    from pointsplat_ns.scene.formats import SOG_META
+    from pointsplat_ns.scene.runs import name_of
 
     file = path / SOG_META if path.is_dir() else path
     return (

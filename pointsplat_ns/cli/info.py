@@ -13,7 +13,7 @@ from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json
 
 if TYPE_CHECKING:
-    from pointsplat_ns.scene_info import SceneInfo
+    from pointsplat_ns.tools.scene_info import SceneInfo
 
 
 def info(
@@ -77,15 +77,15 @@ def info(
 
 def _scenes_of(path: Path) -> list[Path]:
     """A scene itself, or the scenes of a folder."""
-    from pointsplat_ns.io.discovery import find_scenes
-    from pointsplat_ns.io.scene import is_folder_of_scenes
+    from pointsplat_ns.scene.discovery import find_scenes
+    from pointsplat_ns.scene.reading import is_folder_of_scenes
 
     return [*find_scenes(path).values()] if is_folder_of_scenes(path) else [path]
 
 
 def _print_table(found: list[SceneInfo]) -> None:
     """A line for each scene, sizes in MB."""
-    from pointsplat_ns.io.files import three_digits
+    from pointsplat_ns.system.files import three_digits
     from pointsplat_ns.system.terminal import print_table
 
     rows = []
@@ -107,7 +107,7 @@ def _print_table(found: list[SceneInfo]) -> None:
 
 
 def _print(found: SceneInfo) -> None:
-    from pointsplat_ns.io.files import bytes_text
+    from pointsplat_ns.system.files import bytes_text
 
     print(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
     print(

@@ -12,7 +12,7 @@ from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
-    from pointsplat_ns.levels.levels import Levels
+    from pointsplat_ns.tools.levels.levels import Levels
 
 
 def lod(
@@ -64,7 +64,7 @@ def lod(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.io.discovery import FOLDER_FILES
+    from pointsplat_ns.scene.discovery import FOLDER_FILES
 
     options.need_one_scene(scene)
     options.check_poses(poses)
@@ -101,10 +101,10 @@ def lod(
 
 
 def _print_table(made: Levels, folder: Path) -> None:
-    from pointsplat_ns.compression.quality import word_for
-    from pointsplat_ns.io.discovery import FOLDER_FILES
-    from pointsplat_ns.io.files import bytes_text, three_digits
-    from pointsplat_ns.pruning import ply_bytes
+    from pointsplat_ns.pipeline.quality import word_for
+    from pointsplat_ns.prune import ply_bytes
+    from pointsplat_ns.scene.discovery import FOLDER_FILES
+    from pointsplat_ns.system.files import bytes_text, three_digits
 
     apart = (folder / FOLDER_FILES.levels).exists()  # each level has a PLY of its own
     rows = []

@@ -13,9 +13,9 @@ from typing import IO, TYPE_CHECKING, Any
 from pointsplat_ns.system.quantities import seconds_text
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.quality import Quality
-    from pointsplat_ns.gaussians import Gaussians
-    from pointsplat_ns.io.ply import PlyRows
+    from pointsplat_ns.pipeline.quality import Quality
+    from pointsplat_ns.scene.gaussians import Gaussians
+    from pointsplat_ns.scene.ply import PlyRows
 
 _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
@@ -37,7 +37,7 @@ def only_json(args: list[str]) -> Iterator[None]:
 
 def print_json(content: Any) -> None:
     """Print a result as JSON."""
-    from pointsplat_ns.io.files import json_text
+    from pointsplat_ns.system.files import json_text
 
     print(json_text(content), file=_OUTPUT.get(), flush=True)
 
@@ -98,13 +98,13 @@ def print_if_larger(scene: Path, where: Path) -> None:
 def psnr_text(psnr: float | None) -> str:
     """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was
     compared."""
-    from pointsplat_ns.compression.quality import MOST_SAID
+    from pointsplat_ns.pipeline.quality import MOST_SAID
 
     return "-" if psnr is None else "same" if psnr == math.inf else f"{min(psnr, MOST_SAID):.1f}"
 
 
 def written_size(where: Path) -> str:
     """Size of a scene's file, in words."""
-    from pointsplat_ns.io.files import bytes_text
+    from pointsplat_ns.system.files import bytes_text
 
     return bytes_text(where.stat().st_size)

@@ -58,15 +58,15 @@ def prune(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.compacting import Looking, prune_source
-    from pointsplat_ns.comparing.sizes import parse_resolution
-    from pointsplat_ns.compression.prune_file import prune_file, rows_to_prune
-    from pointsplat_ns.compression.quality import judge_of, quality_of_file
-    from pointsplat_ns.compression.requests import PruneRequest
-    from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.io.ply import PlyRows
-    from pointsplat_ns.looking.upright import up_named
+    from pointsplat_ns.pipeline.options import PruneRequest
+    from pointsplat_ns.pipeline.prune_file import prune_file, rows_to_prune
+    from pointsplat_ns.pipeline.quality import judge_of, quality_of_file
+    from pointsplat_ns.pipeline.requests import Looking, prune_source
+    from pointsplat_ns.render.comparison.sizes import parse_resolution
+    from pointsplat_ns.scene.formats import format_to_write
+    from pointsplat_ns.scene.ply import PlyRows
     from pointsplat_ns.system.progress import progress_bar
+    from pointsplat_ns.view_sampling.upright import up_named
 
     options.need_one_scene(scene)
     options.check_poses(poses)

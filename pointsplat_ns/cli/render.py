@@ -45,7 +45,7 @@ def render(
     """
     options.need_scenes(scene, other)
     import pointsplat_ns as ps
-    from pointsplat_ns.io.files import bytes_text
+    from pointsplat_ns.system.files import bytes_text
 
     start = time.perf_counter()
     options.check_poses(poses)

@@ -74,7 +74,7 @@ def output_beside(scene: Path, what: str, suffix: str | None = None) -> Path:
     """The default path of a result, by default in the format of the scene's file. For a file, it is
     beside it: ``room_pruned.ply`` for ``room.ply``. For a run, it is in its folder: ``pruned.ply``;
     never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint."""
-    from pointsplat_ns.io.formats import format_like
+    from pointsplat_ns.scene.formats import format_like
 
     name = f"{what}{format_like(scene).suffix if suffix is None else suffix}"
     if scene.is_dir():
@@ -107,7 +107,7 @@ def need_scenes(*paths: Path | None) -> None:
 def need_one_scene(path: Path) -> None:
     """Raise a SceneError if the path is a folder of scenes."""
     from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.scene import SCENE_KINDS, is_folder_of_scenes
+    from pointsplat_ns.scene.reading import SCENE_KINDS, is_folder_of_scenes
 
     if is_folder_of_scenes(path):
         raise SceneError(
@@ -121,9 +121,9 @@ def check_outputs(
 ) -> None:
     """Check the files that a command is going to write (a scene of any writable format, a picture,
     a page) before its long computations. Raises SceneError if a path has another suffix, or as
-    :func:`~pointsplat_ns.io.files.need_writable`."""
-    from pointsplat_ns.io.files import need_suffix, need_writable
-    from pointsplat_ns.io.formats import format_to_write
+    :func:`~pointsplat_ns.system.files.need_writable`."""
+    from pointsplat_ns.scene.formats import format_to_write
+    from pointsplat_ns.system.files import need_suffix, need_writable
 
     if scene is not None:
         format_to_write(scene)
@@ -139,8 +139,8 @@ def check_poses(poses: Path | None) -> None:
     if poses is None:
         return
     from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.camera_files import CAMERA_KINDS, is_camera_file
-    from pointsplat_ns.photos.posed_scene import without_poses
+    from pointsplat_ns.pipeline.photos.posed_scene import without_poses
+    from pointsplat_ns.scene.camera_files import CAMERA_KINDS, is_camera_file
 
     if not (without_poses(poses) or is_camera_file(poses)):
         raise SceneError(

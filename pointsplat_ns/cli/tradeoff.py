@@ -12,7 +12,7 @@ from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
-    from pointsplat_ns.tradeoff.points import Tradeoff
+    from pointsplat_ns.tools.tradeoff.points import Tradeoff
 
 
 def tradeoff(
@@ -48,9 +48,9 @@ def tradeoff(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.quality import quality_line
-    from pointsplat_ns.tradeoff.points import RESULTS
-    from pointsplat_ns.tradeoff.recommend import next_best
+    from pointsplat_ns.pipeline.quality import quality_line
+    from pointsplat_ns.tools.tradeoff.points import RESULTS
+    from pointsplat_ns.tools.tradeoff.recommend import next_best
 
     options.check_poses(poses)
     folder = output or options.output_beside(scene, "tradeoff", "")
@@ -90,7 +90,7 @@ def tradeoff(
 
 def _print_table(found: Tradeoff) -> None:
     """The figures that matter most; the others are in the table on disk."""
-    from pointsplat_ns.io.files import three_digits
+    from pointsplat_ns.system.files import three_digits
 
     photos = found.points[0].against_photos is not None
     count = counted(len(found.points), "point")

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.files import one_line
 from pointsplat_ns.metrics import ImageError, as_nchw, per_image
+from pointsplat_ns.system.files import one_line
 
 Net = Literal["alex", "vgg"]
 

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.errors import DataError, MissingPackageError, SceneError, need
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
-from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
-from pointsplat_ns.photos.examples import Photos
-from pointsplat_ns.photos.posed_scene import check_photos
-from pointsplat_ns.view_source import ViewSource
-from pointsplat_ns.views import Views
+from pointsplat_ns.pipeline.photos.examples import Photos
+from pointsplat_ns.pipeline.photos.posed_scene import check_photos
+from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.view_sampling.upright import Up
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import Split
@@ -62,7 +62,7 @@ def view_source(
     up: Up | None = None,
 ) -> ViewSource:
     """The source of a scene's views: given ones, those of a run's dataset, else sampled ones;
-    arguments as of :class:`~pointsplat_ns.view_source.ViewSource` and :func:`dataset_views`."""
+    arguments as of :class:`~pointsplat_ns.pipeline.view_provider.ViewSource` and :func:`dataset_views`."""
     return ViewSource(
         scene, given, run, functools.partial(dataset_views, data=data), resolution, up
     )

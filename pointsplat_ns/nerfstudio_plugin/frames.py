@@ -28,7 +28,7 @@ from PIL import Image
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.pictures import exif_hint
+from pointsplat_ns.scene.image_files import exif_hint
 from pointsplat_ns.system.tensors import DOUBLES
 
 

@@ -19,7 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import flip_camera_axes
-from pointsplat_ns.io.files import read_text
+from pointsplat_ns.system.files import read_text
 from pointsplat_ns.system.tensors import INDICES
 
 SOURCES = (

@@ -24,11 +24,11 @@ from torch import Tensor, nn
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import DataError, PointSplatError
-from pointsplat_ns.io.files import one_line, replacing
-from pointsplat_ns.io.runs import step_of
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
 from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
+from pointsplat_ns.scene.runs import step_of
 from pointsplat_ns.system import processes
+from pointsplat_ns.system.files import one_line, replacing
 from pointsplat_ns.system.memory import keep_freed_memory
 from pointsplat_ns.system.threads import fixed_threads, one_thread_each
 

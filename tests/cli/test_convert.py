@@ -8,7 +8,7 @@ from refusing import refusal, run
 
 import pointsplat_ns as ps
 from making import cloud, same
-from pointsplat_ns.io.files import bytes_text, three_digits
+from pointsplat_ns.system.files import bytes_text, three_digits
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from refusing import refusal, run
 import pointsplat_ns as ps
 from html_parts import parts_of
 from making import ball, same
-from pointsplat_ns import folders
-from pointsplat_ns.io.formats import format_like, format_to_read
+from pointsplat_ns.scene.formats import format_like, format_to_read
+from pointsplat_ns.tools import folders
 
 
 @pytest.fixture(scope="module")

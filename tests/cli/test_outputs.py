@@ -9,7 +9,7 @@ from refusing import refusal
 import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import repair
+from pointsplat_ns.pipeline import repair
 
 FAILING = (
     "prune damaged.ply -o OUT.ply",

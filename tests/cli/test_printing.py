@@ -11,10 +11,10 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, box_room
-from pointsplat_ns import view_source
 from pointsplat_ns.cli import main
-from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.pipeline import view_provider as view_source
+from pointsplat_ns.system.files import bytes_text
+from pointsplat_ns.view_sampling.sampler import sample_views
 
 COUNT = 60
 

@@ -12,9 +12,9 @@ NOTEBOOK = Path(__file__).parents[2] / "docs" / "quickstart.ipynb"
 SMALLER = f"""
 import pointsplat_ns as ps
 from pointsplat_ns import api
-from pointsplat_ns.compression import repair
+from pointsplat_ns.pipeline import repair
 from pointsplat_ns import view_source
-from pointsplat_ns.looking import settings
+from pointsplat_ns.view_sampling import settings
 
 ps.save(ps.example_room()[::30], "room.ply")
 api.EXAMPLE, repair.STEPS["quick"], view_source.RESOLUTION = "room.ply", 2, (64, 48)

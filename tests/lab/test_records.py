@@ -11,8 +11,8 @@ from lab.numerics import cases, report, stability
 from lab.speed import beside, rasterizer
 from making import box_room
 from peers import peer
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.looking.settings import changed
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.view_sampling.settings import changed
 from quick_looking import USUAL
 
 JUDGED = RECORD / "judge.json", RECORD / "judge_photos.json"

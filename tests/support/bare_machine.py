@@ -13,7 +13,7 @@ import sys
 import traceback
 from contextlib import redirect_stderr, redirect_stdout
 
-from pointsplat_ns.looking.settings import changed
+from pointsplat_ns.view_sampling.settings import changed
 from quick_looking import QUICK
 
 tried: list[str] = []
@@ -45,7 +45,7 @@ def outcome(words: list[str]) -> dict:
 
 if __name__ == "__main__":
     sys.addaudithook(no_network)
-    from pointsplat_ns import view_source
+    from pointsplat_ns.pipeline import view_provider as view_source
 
     view_source.RESOLUTION = (64, 48)
     with changed(QUICK):

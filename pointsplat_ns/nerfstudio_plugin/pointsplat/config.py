@@ -14,11 +14,11 @@ from nerfstudio.engine.trainer import Trainer
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
+from pointsplat_ns.scene.runs import METHOD_NAMES
 from pointsplat_ns.system.processes import (
     by_first,
     connect_torchrun,

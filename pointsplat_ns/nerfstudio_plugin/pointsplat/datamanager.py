@@ -14,11 +14,11 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys, shown_scene
-from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
+from pointsplat_ns.scene.discovery import Supervision, find_runs_and_plys, shown_scene
+from pointsplat_ns.scene.runs import open_run
 
 
 @dataclass

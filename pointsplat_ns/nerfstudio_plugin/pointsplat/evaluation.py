@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.image_files import write_picture
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.terminal import print_table
 from pointsplat_ns.system.threads import now

@@ -18,18 +18,18 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from pointsplat_ns.compression.trained_refiner import network_options
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.metrics import PIXEL_LOSSES, ImageError, PixelLoss, psnr
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
-from pointsplat_ns.pruning import PruneSettings
-from pointsplat_ns.refiner import Refiner, Structure, preset
-from pointsplat_ns.refiner.augmentation import random_transform
+from pointsplat_ns.pipeline.trained_refiner import network_options
+from pointsplat_ns.prune import PruneSettings
+from pointsplat_ns.refine import Refiner, Structure, preset
+from pointsplat_ns.refine.augmentation import random_transform
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.image_files import in_unit_range
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager

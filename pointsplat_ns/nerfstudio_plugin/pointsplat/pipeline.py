@@ -18,9 +18,7 @@ from nerfstudio.engine.callbacks import (
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from pointsplat_ns.compression.trained_refiner import network_options
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat import evaluation
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import (
@@ -29,7 +27,9 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import (
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import evaluate_scene, only_finite
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
-from pointsplat_ns.refiner import save_refiner
+from pointsplat_ns.pipeline.trained_refiner import network_options
+from pointsplat_ns.refine import save_refiner
+from pointsplat_ns.scene.runs import RUN_FILES
 from pointsplat_ns.system import processes
 
 MODEL_METADATA = (

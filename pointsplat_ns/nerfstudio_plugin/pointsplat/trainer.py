@@ -12,10 +12,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.nn.utils import clip_grad_norm_
 from torch.optim.lr_scheduler import LambdaLR
 
-from pointsplat_ns.compression.repair import rate_factor
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainer
+from pointsplat_ns.pipeline.repair import rate_factor
 from pointsplat_ns.system import processes
 
 if TYPE_CHECKING:

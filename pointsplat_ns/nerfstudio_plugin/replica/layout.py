@@ -22,8 +22,8 @@ import numpy as np
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import logger, one_line, read_text
-from pointsplat_ns.io.pictures import exif_hint
+from pointsplat_ns.scene.image_files import exif_hint
+from pointsplat_ns.system.files import logger, one_line, read_text
 
 FARTHEST = 1e18
 """Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot

@@ -15,7 +15,6 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
@@ -24,6 +23,7 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import (
     SplatfactoCpuTrainer,
 )
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
+from pointsplat_ns.scene.gaussians import PARAMETERS
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""

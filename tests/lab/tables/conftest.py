@@ -11,10 +11,10 @@ from lab.tables import layout
 from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
 from making import box_room
-from pointsplat_ns import view_source
-from pointsplat_ns.compression import repair
-from pointsplat_ns.refiner import Refiner, preset
-from pointsplat_ns.refiner.weights import save_refiner
+from pointsplat_ns.pipeline import repair
+from pointsplat_ns.pipeline import view_provider as view_source
+from pointsplat_ns.refine import Refiner, preset
+from pointsplat_ns.refine.weights import save_refiner
 
 
 @pytest.fixture(scope="session")

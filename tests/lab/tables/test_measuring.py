@@ -12,8 +12,8 @@ from lab.tables.measure import Judge
 from lab.tables.ways import WAYS, Ways
 from making import box_room
 from peers import peer
-from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.render.comparison.closeness import DenseReference
 
 
 def cells_of(tables) -> dict:

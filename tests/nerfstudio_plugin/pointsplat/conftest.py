@@ -7,7 +7,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import box_room, fast_config, views_sampled_once
-from pointsplat_ns.io import write_ply
+from pointsplat_ns.scene.ply import write_ply
 
 
 @pytest.fixture(scope="session", autouse=True)

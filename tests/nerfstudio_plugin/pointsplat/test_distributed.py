@@ -26,10 +26,10 @@ from making import (
     views_sampled_once,
 )
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.view_sampling.settings import changed
 from quick_looking import QUICK
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file

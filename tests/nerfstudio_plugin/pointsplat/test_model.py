@@ -19,14 +19,14 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch loa
 from making import SHARED_DATA, pipeline_of, same, small_config
 from pointsplat_ns.cli.export import export
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import PARAMETERS
-from pointsplat_ns.io import read_ply
-from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.metrics import PIXEL_LOSSES
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import VARIANTS, print_summary
-from pointsplat_ns.pruning import METHODS, score_of, select
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.prune import METHODS, score_of, select
+from pointsplat_ns.render import rasterization
+from pointsplat_ns.scene.gaussians import PARAMETERS
+from pointsplat_ns.scene.ply import read_ply
+from pointsplat_ns.scene.runs import open_run
 
 
 def test_untrained_the_refined_scene_is_the_pruned_one_to_the_bit(trained_walls):

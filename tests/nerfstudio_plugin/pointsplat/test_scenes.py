@@ -13,17 +13,17 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 from making import box_room
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.io.runs import open_run
-from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.cameras import carried
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, dataparser_of
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import EPS2D, Views
+from pointsplat_ns.render import render
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.scene.runs import open_run
+from pointsplat_ns.scene.views import EPS2D, Views
+from pointsplat_ns.view_sampling.sampler import sample_views
 
 
 def manager_of(folder: Path, **settings):

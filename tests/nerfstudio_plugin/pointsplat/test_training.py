@@ -13,11 +13,11 @@ from nerfstudio.utils.eval_utils import eval_setup
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from broken_steps import broken
 from making import dense_config, equal, move_zero_layers, small_config
-from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import MODEL_METADATA
-from pointsplat_ns.refiner import read_refiner
-from pointsplat_ns.refiner.weights import read_metadata
+from pointsplat_ns.refine import read_refiner
+from pointsplat_ns.refine.weights import read_metadata
+from pointsplat_ns.scene.runs import RUN_FILES
 
 
 def test_the_checkpoint_holds_the_network_and_nothing_else(trained):

@@ -15,13 +15,14 @@ from nerfstudio.scripts.train import launch
 from broken_steps import broken
 from making import equal, small_config
 from pointsplat_ns.errors import DataError, PointSplatError
-from pointsplat_ns.io import open_run, read_scene
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import (
     SplatfactoCpuTrainer,
     splatfacto_cpu_config,
 )
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import takes_tiny_as_zero
+from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.scene.runs import open_run
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,243 @@
+"""Checkpoints: Splatfacto's (``nerfstudio_models/step-*.ckpt``) and gsplat's
+(``ckpts/ckpt_*_rank0.pt``)."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.scene.gaussians import PARAMETERS, Gaussians
+from pointsplat_ns.system.files import one_line, read_text, require_file, require_memory
+
+EXPECTED = "expected a checkpoint that Splatfacto or gsplat saved"
+
+
+def read_checkpoint(path: Path | str) -> Gaussians:
+    """Read the scene of a checkpoint of Splatfacto, or of gsplat's trainer.
+
+    Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto
+    stores colours as logits, they are converted to SH coefficients of the same colour. The
+    ``cfg.yml`` of a training with gsplat says whether it drew antialiased.
+
+    Returns:
+        The scene, float32 on the CPU, in the frame of the training: for Splatfacto that of the
+        run's dataparser.
+
+    Raises:
+        SceneError: if the file is truncated, is no checkpoint, is one of another method, or a part
+            of one.
+    """
+    path = require_file(path, "a checkpoint")
+    named = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)
+    if named is not None and path.with_name(f"{named[1]}1.pt").exists():
+        raise SceneError(
+            f"{path}: a part of a training on several GPUs; expected the whole scene; export a "
+            "PLY with --save_ply"
+        )
+    content = _load(path)
+    if isinstance(content, dict) and isinstance(
+        content.get("splats"), dict
+    ):  # of gsplat's simple_trainer
+        scene = _scene_of_gsplat(content["splats"], path)
+        return scene.replace(antialiased=_gsplat_antialiased(path))
+    state = _pipeline_state(content, path)
+    # Of current versions, and of those before nerfstudio 1.0, each also with the wrapper of
+    # distributed training.
+    prefixes = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
+    prefix = next((p for p in prefixes if f"{p}means" in state), None)
+    if prefix is None:
+        raise SceneError(
+            f"{path}: a checkpoint of another method; found the keys {_some(state, 4)}; "
+            f"expected {prefixes[0]}means, as Splatfacto saves"
+        )
+    scene = _scene_of(
+        {name: (prefix + name, state.get(prefix + name)) for name in PARAMETERS}, path
+    )
+    if scene.sh_degree == 0:
+        scene = scene.replace(features_dc=(torch.sigmoid(scene.features_dc) - 0.5) / SH_C0)
+    return scene
+
+
+def _gsplat_antialiased(path: Path) -> bool:
+    """Whether the settings of a training with gsplat, ``cfg.yml`` above the checkpoint's folder,
+    say that it drew antialiased; False if there are none."""
+    try:
+        text = read_text(path.absolute().parents[1] / "cfg.yml", 1 << 20)
+    except (OSError, ValueError, IndexError):
+        return False
+    return re.search(r"^antialiased: true\s*$", text, re.M) is not None
+
+
+def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
+    """The scene of gsplat's parameters: opacities (N,), and constant SH coefficients (N, 1, 3)."""
+    keys = dict(zip(PARAMETERS, PARAMETERS, strict=True)) | {
+        "features_dc": "sh0",
+        "features_rest": "shN",
+    }
+    held = {name: splats.get(key) for name, key in keys.items()}
+    if isinstance(opacities := held["opacities"], Tensor) and opacities.dim() == 1:
+        held["opacities"] = opacities[:, None]
+    if isinstance(dc := held["features_dc"], Tensor) and dc.dim() == 3 and dc.shape[1] == 1:
+        held["features_dc"] = dc[:, 0]
+    return _scene_of({name: (key, held[name]) for name, key in keys.items()}, path)
+
+
+def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
+    """The scene of parameters, each with its key in the file; those that cannot be drawn
+    included."""
+    limit = path.stat().st_size
+    require_memory(
+        path, min(limit, sum(4 * value.numel() for _, value in values.values() if _is_dense(value)))
+    )
+    tensors = {name: _parameter(value, key, path, limit) for name, (key, value) in values.items()}
+    try:
+        return Gaussians(*(tensors[name] for name in PARAMETERS))
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
+
+
+def _some(keys: Iterable[Any], count: int) -> str:
+    """The first of some keys, and how many more there are."""
+    names = sorted(str(key) for key in keys)
+    return (", ".join(names[:count]) or "none") + (
+        f" and {len(names) - count} more" if len(names) > count else ""
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoFit:
+    """What a training learned about each of its photos, beside the scene."""
+
+    adjustments: Tensor | None
+    """(C, 6) float32: of each training photo's pose a translation in scene units, then a rotation
+    vector in radians; None if poses were not corrected."""
+    colors: str
+    """Key of parameters that change the colours of each photo, such as a bilateral grid; empty if
+    there are none."""
+
+
+def read_photo_fit(path: Path | str) -> PhotoFit:
+    """Read what a Splatfacto checkpoint holds about each training photo. Loads as
+    :func:`read_checkpoint`.
+
+    Raises:
+        SceneError: if the file is no checkpoint, or its corrections of poses are not (C, 6) finite
+            numbers.
+    """
+    path = require_file(path, "a Splatfacto checkpoint")
+    state = _pipeline_state(_load(path), path)
+    names = [key for key in state if isinstance(key, str)]
+    key = next((name for name in names if name.endswith("camera_optimizer.pose_adjustment")), None)
+    adjustments = None if key is None else _parameter(state[key], key, path, path.stat().st_size)
+    if adjustments is not None and not (
+        adjustments.dim() == 2 and adjustments.shape[1] == 6 and bool(adjustments.isfinite().all())
+    ):
+        raise SceneError(
+            f"{path}: {key!r} of shape {tuple(adjustments.shape)}; expected six finite numbers "
+            "for each training photo"
+        )
+    words = re.compile(r"bil_?grid|bilateral|appearance|embed|exposure")
+    colors = next(
+        (name for name in sorted(names) if name.startswith("_model.") and words.search(name)), ""
+    )
+    return PhotoFit(adjustments, colors)
+
+
+def is_complete(path: Path) -> bool:
+    """Whether a checkpoint's archive is complete, that is, has the directory at its end."""
+    try:
+        return path.is_file() and zipfile.is_zipfile(path)
+    except (OSError, zipfile.BadZipFile):  # of an archive in several parts
+        return False
+
+
+def allow_splatfacto_checkpoints() -> None:
+    """Register numpy's float64 scalars with torch's ``weights_only`` loader, if they are not.
+
+    Every Splatfacto checkpoint holds such a scalar in the state of its schedulers. The functions
+    registered here rebuild it from its bytes; they cannot run code from the file.
+    """
+    # numpy 2 renamed the module.
+    scalar = importlib.import_module(
+        f"numpy.{'_core' if hasattr(np, '_core') else 'core'}.multiarray"
+    ).scalar
+    allowed: list[Any] = [np.dtype, type(np.dtype(np.float64))]
+    # A checkpoint may come from the other major version of numpy, so register the function under
+    # both names.
+    allowed += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    present = torch.serialization.get_safe_globals()
+    torch.serialization.add_safe_globals([entry for entry in allowed if entry not in present])
+
+
+def _load(path: Path) -> Any:
+    """Load a checkpoint, with its tensors memory-mapped if it is an archive."""
+    if path.stat().st_size == 0:
+        raise SceneError(f"{path}: the file is empty; {EXPECTED}")
+    archive = is_complete(path)
+    if not archive and path.open("rb").read(2) == b"PK":
+        raise SceneError(
+            f"{path}: truncated, the archive has no end; {EXPECTED}; train or copy it again"
+        )
+    allow_splatfacto_checkpoints()
+    try:
+        if archive:
+            with zipfile.ZipFile(path) as content:
+                if sum(entry.file_size for entry in content.infolist()) > path.stat().st_size:
+                    raise SceneError(f"{path}: a compressed archive; {EXPECTED}")
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=archive)
+    except SceneError:
+        raise
+    except Exception as error:  # a damaged pickle can raise nearly anything
+        why = f"truncated or not a checkpoint ({type(error).__name__}: {one_line(error, 100)})"
+        if foreign := re.search(r"GLOBAL ([\w.]+)", str(error)):
+            why = f"holds an object of type {foreign[1]}, which only running its code could load"
+        raise SceneError(f"{path}: {why}; {EXPECTED}") from error
+
+
+def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
+    state = content.get("pipeline") if isinstance(content, dict) else None
+    if not isinstance(state, dict):
+        found = _some(content, 6) if isinstance(content, dict) else type(content).__name__
+        raise SceneError(
+            f"{path}: not a checkpoint of a scene; found {found}; expected the key 'pipeline' of "
+            "nerfstudio, or 'splats' of gsplat"
+        )
+    return state
+
+
+def _is_dense(value: Any) -> TypeGuard[Tensor]:
+    """Whether a value is a tensor of plain numbers: not one that is nested, sparse, quantised or
+    without content."""
+    if not isinstance(value, Tensor) or value.is_nested:
+        return False
+    floats = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+    return value.dtype in floats and value.layout == torch.strided and value.device.type == "cpu"
+
+
+def _parameter(value: Any, key: str, path: Path, limit: int) -> Tensor:
+    """A float32 copy of one parameter, independent of the mapped file."""
+    if value is None:
+        raise SceneError(f"{path}: lacks the key {key!r}; {EXPECTED}")
+    if not _is_dense(value):
+        kind = (
+            f"{value.dtype} {value.layout} on {value.device}"
+            if isinstance(value, Tensor)
+            else type(value).__name__
+        )
+        raise SceneError(f"{path}: {key!r} is {kind}; expected a dense floating-point tensor")
+    if value.numel() * value.element_size() > limit:
+        raise SceneError(
+            f"{path}: {key!r} has shape {tuple(value.shape)}, more than the file can hold"
+        )
+    return value.detach().to(torch.float32, copy=True, memory_format=torch.contiguous_format)

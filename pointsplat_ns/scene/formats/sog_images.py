@@ -1,0 +1,138 @@
+"""The WebP images of SOG files, in a zip archive or a folder."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.scene.formats.coding import Array
+from pointsplat_ns.system.files import require_file, require_memory
+
+SOG_META = "meta.json"
+
+
+class Images:
+    """The parts of one SOG file: a zip archive, a folder, or the ``meta.json`` in one. Errors are
+    as :func:`~pointsplat_ns.scene.formats.coding.damage_named` has them, and SceneErrors."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._zip: zipfile.ZipFile | None = None
+        self._folder = path if path.is_dir() else path.parent
+        if path.is_dir() or path.name == SOG_META:
+            require_file(self._folder / SOG_META, f"{SOG_META} of a SOG folder")
+        else:
+            self._zip = zipfile.ZipFile(require_file(path, "a .sog file"))
+
+    def close(self) -> None:
+        """Close the archive."""
+        if self._zip is not None:
+            self._zip.close()
+
+    @property
+    def size(self) -> int:
+        """Bytes of the archive, or of all images in the folder."""
+        if self._zip is not None:
+            return self.path.stat().st_size
+        return sum(part.stat().st_size for part in self._folder.glob("*.webp"))
+
+    def meta(self) -> dict[str, Any]:
+        """The content of ``meta.json``."""
+        content = json.loads(self._bytes(SOG_META, 1 << 22))  # one has about 20 kB
+        if not isinstance(content, dict):
+            raise SceneError(
+                f"{self.path}: {SOG_META} holds a {type(content).__name__}; expected an object"
+            )
+        return content
+
+    def pixels(self, name: Any, least: int, width: int | None = None) -> Array:
+        """The pixels of one image, (height, width, 4) uint8, RGBA.
+
+        Args:
+            name: its file name, as ``meta.json`` gives it.
+            least: the number of pixels that are needed.
+            width: of the image, pixels, if it matters.
+
+        Raises:
+            SceneError: if the image is missing, is no WebP, or has too few pixels or far too many.
+        """
+        from PIL import Image
+
+        if not isinstance(name, str) or PurePosixPath(name).name != name or "\\" in name:
+            raise SceneError(
+                f"{self.path}: an image called {name!r}; expected the name of a file beside "
+                f"{SOG_META}"
+            )
+        most = 6 * least + (
+            1 << 16
+        )  # version 1 leaves open which of 3, 8 and 15 SH; some programs round sides up
+        data = self._bytes(name, 4 * most)
+        across, down = webp_size(data)  # opening an image takes the memory of its pixels already
+        if across * down < least or across * down > most or width not in (None, across):
+            needed = f"{least} pixels" + (f", {width} across" if width else "")
+            raise SceneError(f"{self.path}: {name} has {across} x {down} pixels; expected {needed}")
+        require_memory(self.path, 8 * across * down)
+        try:
+            with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
+                return np.asarray(image.convert("RGBA"))
+        except Image.DecompressionBombError as error:
+            raise SceneError(f"{self.path}: {name} is too large ({error})") from error
+
+    def _bytes(self, name: str, most: int) -> bytes:
+        """The content of one part, which must not exceed ``most`` bytes."""
+        if self._zip is None:
+            part = require_file(self._folder / name, "a part of a SOG folder")
+            size = part.stat().st_size
+        else:
+            entries = [
+                entry
+                for entry in self._zip.infolist()
+                if PurePosixPath(entry.filename).name == name
+            ]
+            if len(entries) != 1:
+                raise SceneError(
+                    f"{self.path}: holds {len(entries)} files called {name}; expected one"
+                )
+            size = entries[0].file_size
+        if size > most:
+            raise SceneError(f"{self.path}: {name} has {size} bytes; expected at most {most}")
+        with part.open("rb") if self._zip is None else self._zip.open(entries[0]) as stream:
+            return stream.read(most + 1)  # the size in the archive may be a lie
+
+
+def webp_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a WebP image in pixels, as its header says (RFC 9649); a ValueError if it
+    is none."""
+    kind = data[12:16]
+    head = data[20:30]
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(head) == 10:
+        if kind == b"VP8X":
+            return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
+        if kind == b"VP8L" and head[0] == 0x2F:
+            bits = int.from_bytes(head[1:5], "little")
+            return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+        if kind == b"VP8 ":
+            return int.from_bytes(head[6:8], "little") & 0x3FFF, int.from_bytes(
+                head[8:10], "little"
+            ) & 0x3FFF
+    raise ValueError("not a WebP image")
+
+
+def webp(pixels: Array, width: int, height: int) -> bytes:
+    """A lossless WebP image of pixels (up to width * height, 3 or 4), uint8; the rest is filled
+    with zeros."""
+    from PIL import Image
+
+    full = np.zeros((height * width, pixels.shape[1]), np.uint8)
+    full[: len(pixels)] = pixels
+    stream = io.BytesIO()
+    image = Image.fromarray(full.reshape(height, width, -1))
+    # "exact" keeps the colours where alpha is 0.
+    image.save(stream, "WEBP", lossless=True, exact=True, quality=60, method=4)
+    return stream.getvalue()

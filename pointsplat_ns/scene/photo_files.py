@@ -1,0 +1,272 @@
+"""Photos in a folder: which belong to the cameras of a file, and their pixels as pinholes see
+them."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.geometry.lenses import Lens, lens_of, pixel_map
+from pointsplat_ns.scene.camera_files import NamedViews
+from pointsplat_ns.scene.camera_files.cameras import Camera
+from pointsplat_ns.scene.image_files import exif_hint
+from pointsplat_ns.system.files import one_line
+from pointsplat_ns.system.tensors import DOUBLES
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+
+MOST_PIXELS = 150_000_000
+"""Largest photo that is decoded: 450 MB as bytes of RGB."""
+
+
+def photo_files(folder: Path) -> list[str]:
+    """Paths of the photos in a folder or below, relative to it with ``/`` between folders, sorted;
+    hidden ones are not among them. Raises DataError if there are none, or too many, or there is no
+    such folder."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; expected the folder of the photos")
+    found: list[str] = []
+    for place, inner, files in os.walk(folder):
+        inner[:] = [name for name in inner if not name.startswith(".")]
+        relative = Path(place).relative_to(folder)
+        shown = (name for name in files if not name.startswith("."))
+        found += [
+            (relative / name).as_posix() for name in shown if name.lower().endswith(PHOTO_SUFFIXES)
+        ]
+        if len(found) > 100_000:
+            raise DataError(
+                f"{folder}: more than 100,000 photos; expected the folder of one capture's photos"
+            )
+    if not found:
+        raise DataError(f"{folder}: no photo in it; expected files {', '.join(PHOTO_SUFFIXES)}")
+    return sorted(found)
+
+
+def photos_of_cameras(folder: Path, files: Sequence[str], named: NamedViews) -> dict[int, Path]:
+    """The photo of each view that has one, by the index of the view.
+
+    A photo lies in the folder under the name that the model has; else where the model's own folder
+    has it; else it is the only one whose path ends like the name, suffixes apart. A photo that two
+    views would have is nobody's.
+    """
+    root = folder.absolute()
+    known = set(files)
+    by_end = defaultdict(list)
+    for file in files:
+        parts = _parts(file)
+        for first in range(len(parts)):
+            by_end[parts[first:]].append(file)
+    found: dict[int, str] = {}
+    for index, name in enumerate(named.names):
+        plain = PurePosixPath(name.replace("\\", "/")).as_posix()
+        own = named.photo(index)
+        if own is not None and root in own.absolute().parents:
+            own_name = own.absolute().relative_to(root).as_posix()
+        else:
+            own_name = ""
+        if plain in known or own_name in known:
+            found[index] = plain if plain in known else own_name
+            continue
+        parts = _parts(plain)
+        ends = (by_end.get(parts[first:], []) for first in range(len(parts)))
+        if len(same := next(filter(None, ends), [])) == 1:
+            found[index] = same[0]
+    taken = Counter(found.values())
+    return {index: folder / file for index, file in found.items() if taken[file] == 1}
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """The folders and the name of a photo, without a suffix of photos."""
+    path = PurePosixPath(name)
+    return path.with_suffix("").parts if path.suffix.lower() in PHOTO_SUFFIXES else path.parts
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photo as a pinhole sees it."""
+
+    image: Tensor  # [H, W, 3] uint8, transparent parts over black
+    mask: Tensor | None  # [H, W, 1] bool, the pixels that count; None for all
+    K: Tensor  # [3, 3] float64 intrinsics, pixels
+
+
+class PhotoReader:
+    """Reads photos of cameras: reduced while decoding, undistorted, and with the mask that the file
+    of cameras names.
+
+    The pinhole has the focal lengths and the principal point of the camera. Pixels that the lens
+    does not show do not count. What is computed for a lens is kept: a capture has few.
+
+    Args:
+        masks: the folder in which, or below which, the masks lie that cameras name.
+        side: longer side of the pictures, pixels; smaller photos stay as they are.
+        folder: of the photos. Where cameras name no mask, that of ``a.jpg`` is ``a.jpg.png``, as
+            COLMAP names it, or ``a.png`` in the folder ``masks`` beside it.
+    """
+
+    def __init__(self, masks: Path, side: int, folder: Path | None = None):
+        self._masks = masks
+        self._side = side
+        self._folder = folder
+        self._maps: dict[tuple, tuple[Tensor, Tensor]] = {}
+
+    def size(self, path: Path, camera: Camera) -> tuple[int, int]:
+        """Width and height, pixels, that a photo will have. Its pixels are not decoded. Errors are
+        those of :meth:`read`."""
+        return self._opened(path, camera)[0]
+
+    def read(self, path: Path, camera: Camera) -> Photo:
+        """The photo of a camera. Raises DataError if it cannot be read, is huge or of another shape
+        than the camera, or its lens cannot be undone."""
+        from PIL import Image, ImageOps
+
+        size, turned = self._opened(path, camera)
+        try:
+            with Image.open(path) as opened:
+                opened.draft(
+                    "RGB", size[::-1] if turned else size
+                )  # JPEGs are decoded at a half or less
+                kind = (
+                    "RGBA"
+                    if opened.mode in ("RGBA", "LA", "PA") or "transparency" in opened.info
+                    else "RGB"
+                )
+                upright = ImageOps.exif_transpose(opened) if turned else opened
+                picture = np.array(upright.convert(kind).resize(size, Image.Resampling.BOX))
+        except (
+            OSError,
+            ValueError,
+            SyntaxError,
+            MemoryError,
+            Image.DecompressionBombError,
+        ) as error:
+            raise DataError(f"{path}: cannot be read as a photo ({one_line(error, 80)})") from error
+        image = torch.from_numpy(picture)
+        if image.shape[2] == 4:
+            image = (image[..., :3].int() * image[..., 3:].int() // 255).to(torch.uint8)
+        mask = self._mask(path, camera, size)
+        K = torch.eye(3, **DOUBLES)
+        for axis in range(2):
+            stretch = size[axis] / camera.size[axis]
+            K[axis, axis] = camera.focal[axis] * stretch
+            K[axis, 2] = camera.centre[axis] * stretch
+        try:
+            lens = lens_of(camera.model, camera.distortion)
+        except ValueError as error:
+            raise DataError(
+                f"{path}: its camera has {error}; undistort the photos (colmap image_undistorter) "
+                "and take the model that this writes"
+            ) from error
+        if lens is None:
+            return Photo(image, mask, K)
+        places, shown = self._map(path, lens, K, size)
+        image = _sampled(image, places).round().to(torch.uint8)
+        shown = shown if mask is None else shown & (_sampled(mask, places) > 0.5)
+        return Photo(image, shown, K)
+
+    def _opened(self, path: Path, camera: Camera) -> tuple[tuple[int, int], bool]:
+        """The size that a photo will have, and whether its EXIF orientation is followed, which is
+        so where the camera is that of the turned photo."""
+        from PIL import Image
+
+        try:
+            with Image.open(path) as opened:
+                size = opened.size
+                mode = opened.mode
+                hint = exif_hint(path, (int(camera.size[0]), int(camera.size[1])))
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            raise DataError(f"{path}: cannot be read as a photo ({one_line(error, 80)})") from error
+        if size[0] * size[1] > MOST_PIXELS:
+            raise DataError(
+                f"{path}: {size[0]} x {size[1]} pixels; expected at most {MOST_PIXELS / 1e6:.0f} "
+                "million"
+            )
+        if mode.startswith(("I", "F")):
+            raise DataError(
+                f"{path}: its pixels are of mode {mode}; expected 8 bits a channel; convert it"
+            )
+        turned = bool(hint)
+        width, height = size[::-1] if turned else size
+        if abs(width * camera.size[1] / (height * camera.size[0]) - 1) > 0.02:
+            raise DataError(
+                f"{path}: {width} x {height} pixels, but its camera says {camera.size[0]:.0f} x "
+                f"{camera.size[1]:.0f}; expected that shape: the photos that the poses were "
+                "computed from, or smaller copies"
+            )
+        factor = min(1.0, self._side / max(width, height))
+        return (max(1, round(width * factor)), max(1, round(height * factor))), turned
+
+    def mask_of(self, path: Path, camera: Camera) -> Path | None:
+        """The file of the mask of a photo; None if all its pixels count. Raises DataError if the
+        mask that its camera names is not there."""
+        relative = PurePosixPath(camera.mask if "\0" not in camera.mask else "")
+        if relative.name:
+            mask = self._masks / relative
+            if (
+                relative.is_absolute() or ".." in relative.parts or not mask.is_file()
+            ):  # nothing outside is opened
+                raise DataError(
+                    f"{mask}: no such mask, but the cameras name it; put it there, or take its "
+                    "name away"
+                )
+            return mask
+        if self._folder is None:
+            return None
+        own = self._folder.absolute().parent / "masks" / path.relative_to(self._folder)
+        names = (own.with_name(f"{own.name}.png"), own.with_suffix(".png"))
+        return next((name for name in names if name.is_file()), None)
+
+    def _mask(self, photo: Path, camera: Camera, size: tuple[int, int]) -> Tensor | None:
+        """The mask of a photo, (H, W, 1) bool. White pixels count."""
+        from PIL import Image
+
+        path = self.mask_of(photo, camera)
+        if path is None:
+            return None
+        try:
+            with Image.open(path) as opened:
+                if opened.width * opened.height > MOST_PIXELS:
+                    raise ValueError(f"more than {MOST_PIXELS / 1e6:.0f} million pixels")
+                small = opened.convert("L").resize(size, Image.Resampling.BOX)
+        except (
+            OSError,
+            ValueError,
+            SyntaxError,
+            MemoryError,
+            Image.DecompressionBombError,
+        ) as error:
+            raise DataError(f"{path}: cannot be read as a mask ({one_line(error, 80)})") from error
+        return torch.from_numpy(np.array(small)).ge(128)[..., None]
+
+    def _map(
+        self, path: Path, lens: Lens, K: Tensor, size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        key = (lens, *K.flatten().tolist(), size)
+        if key not in self._maps:
+            places, shown = pixel_map(lens, K, *size)
+            if float(shown.double().mean()) < 0.1:
+                raise DataError(
+                    f"{path}: the lens distortion of its camera leaves nothing of the photo; "
+                    "check its coefficients"
+                )
+            if len(self._maps) >= 8:  # of a lens for each photo none is needed twice
+                self._maps.pop(next(iter(self._maps)))
+            self._maps[key] = places, shown[..., None]
+        return self._maps[key]
+
+
+def _sampled(image: Tensor, places: Tensor) -> Tensor:
+    """An image (H, W, C) at places (h, w, 2), bilinear: (h, w, C) float32."""
+    planes = image.permute(2, 0, 1)[None].float()
+    return F.grid_sample(planes, places[None], padding_mode="border", align_corners=False)[
+        0
+    ].permute(1, 2, 0)

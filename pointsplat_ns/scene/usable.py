@@ -1,0 +1,36 @@
+"""Scenes as they are read and written: without the Gaussians that cannot be drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.system.files import logger
+
+
+def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
+    """``scene`` without infinite values, and without the Gaussians that cannot be drawn, whose
+    number is logged.
+
+    Opacity logits of +-Inf (opacity 1 and 0) and log-scales of -Inf (a flat axis) can be drawn (see
+    :meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable`). They become +-30 and -87, which draw the
+    same in float32.
+    """
+    usable = usable_part(scene)
+    dropped = len(scene) - len(usable)
+    if dropped:
+        logger.warning(
+            "%s: dropped %d of %d Gaussians with NaN or infinite values", path, dropped, len(scene)
+        )
+    return usable
+
+
+def usable_part(scene: Gaussians) -> Gaussians:
+    """As :func:`keep_usable`, always, and without a warning."""
+    usable = scene.usable()
+    if not bool(usable.all()):
+        scene = scene[usable]
+    if bool(scene.opacities.isinf().any()) or bool(scene.scales.isinf().any()):
+        opacities = scene.opacities.nan_to_num(posinf=30.0, neginf=-30.0)
+        scene = scene.replace(opacities=opacities, scales=scene.scales.nan_to_num(neginf=-87.0))
+    return scene

@@ -1,0 +1,91 @@
+"""Files of cameras that lie beside a scene: which are used, which are not, and what is said."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import run_of
+from pointsplat_ns.cli import main
+from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.pipeline.requests import Looking, read_source
+from posing import inria, nerfstudio, write_photos, write_sparse
+
+
+@pytest.fixture(scope="module")
+def views(scene) -> ps.Views:
+    return ps.sample_views(scene, 6, 64, 48)
+
+
+def known(path: Path, poses: str | None = None) -> ps.Views | None:
+    return read_source(path, Looking(poses))[1].given
+
+
+def same(found: ps.Views | None, views: ps.Views) -> bool:
+    return found is not None and torch.allclose(found.viewmats, views.viewmats.double(), atol=1e-5)
+
+
+@pytest.mark.parametrize("place", ["point_cloud/iteration_30000/point_cloud.ply", "room.ply"])
+def test_cameras_that_3dgs_training_wrote_are_used_and_named(place, scene, views, tmp_path, said):
+    path = tmp_path / place
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ps.save(scene, path)
+    (tmp_path / "cameras.json").write_text(json.dumps(inria(views)))
+    assert same(known(path), views)
+    assert f"poses: {tmp_path / 'cameras.json'}; --poses none" in said.text
+    main(["prune", str(path), "--keep", "100", "--poses", "none"])
+    assert (
+        known(path, "none") is None
+        and known(path.parent / path.name, str(tmp_path / "cameras.json")) is not None
+    )
+
+
+def test_poses_of_another_frame_are_not_used(scene, views, tmp_path, said):
+    ps.save(scene, tmp_path / "room.ply")
+    poses = invert_rigid(views.viewmats.double())
+    poses[:, :3, 3] += 1000
+    (tmp_path / "cameras.json").write_text(
+        json.dumps(inria(replace(views, viewmats=invert_rigid(poses))))
+    )
+    assert (
+        known(tmp_path / "room.ply") is None and "cameras.json: not used for views: " in said.text
+    )
+
+
+@pytest.mark.parametrize("kind", ["transforms.json", "colmap", "colmap above"])
+def test_poses_of_data_count_where_photos_tell_that_they_belong(kind, scene, views, tmp_path, said):
+    """Their frame is that of the data, which may be another scene's."""
+    path = tmp_path / ("out/room.ply" if kind == "colmap above" else "room.ply")
+    path.parent.mkdir(exist_ok=True)
+    ps.save(scene, path)
+    if kind == "transforms.json":
+        (tmp_path / kind).write_text(json.dumps(nerfstudio(views)))
+    else:
+        write_sparse(views, tmp_path / "sparse" / "0")
+    assert (
+        known(path) is None
+        and "no photos beside it tell whether it belongs to the scene" in said.text
+    )
+    write_photos(scene, views, tmp_path / "images")
+    assert same(known(path), views)
+    write_photos(scene, views[torch.arange(len(views)).flip(0).tolist()], tmp_path / "images")
+    assert (
+        known(path) is None
+        and "no more like the photos of their views than like others" in said.text
+    )
+
+
+def test_damaged_files_beside_a_scene_stop_nothing(scene, tmp_path, said):
+    ps.save(scene, tmp_path / "room.ply")
+    (tmp_path / "cameras.json").write_text("[{}]")
+    (tmp_path / "transforms.json").write_text("{")
+    assert known(tmp_path / "room.ply") is None and said.text.count("not used for views") == 2
+
+
+def test_none_passes_over_the_dataset_of_a_run_too(trained_walls):
+    run = run_of(trained_walls, "wall-a")
+    assert read_source(run, Looking())[1].known(3) is not None
+    assert read_source(run, Looking("none"))[1].known(3) is None
