@@ -25,11 +25,11 @@ from pointsplat_ns.pipeline.feedback_features import REPAIR, Feedback
 from pointsplat_ns.pipeline.optimiser import gradients_of
 from pointsplat_ns.pipeline.repair import initial_rate_factor, rate_factor
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
-from pointsplat_ns.prune import prune
-from pointsplat_ns.refine.feedback import FeedbackRefiner, save_feedback_refiner
-from pointsplat_ns.render import render
-from pointsplat_ns.render.comparison.closeness import DenseReference
-from pointsplat_ns.render.comparison.sizes import RESOLUTION, middle_sized, several_sizes
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.refinement.feedback import FeedbackRefiner, save_feedback_refiner
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
+from pointsplat_ns.rendering.comparison.sizes import RESOLUTION, middle_sized, several_sizes
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system import processes

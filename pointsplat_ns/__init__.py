@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.pipeline.report import Compacted
     from pointsplat_ns.pipeline.requests import clean
     from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner, load_refiner, refine
-    from pointsplat_ns.render import rasterization, render
+    from pointsplat_ns.rendering import rasterization, render
     from pointsplat_ns.scene.gaussians import Gaussians
     from pointsplat_ns.scene.reading import save
     from pointsplat_ns.scene.views import View, Views
@@ -80,7 +80,7 @@ _PUBLIC = {
     "pointsplat_ns.metrics.lpips": ("lpips",),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
     "pointsplat_ns.tools.tradeoff.measure_table": ("measure_tradeoff",),
-    "pointsplat_ns.render": ("rasterization", "render"),
+    "pointsplat_ns.rendering": ("rasterization", "render"),
     "pointsplat_ns.tools.tradeoff.points": ("Tradeoff",),
     "pointsplat_ns.scene.views": ("View", "Views"),
 }

@@ -26,7 +26,7 @@ from pointsplat_ns.pipeline.trained_refiner import (
     refine,
     scenes_of_run,
 )
-from pointsplat_ns.prune import Keep
+from pointsplat_ns.pruning import Keep
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene, source_file

@@ -52,11 +52,8 @@ class SceneError(PointSplatError):
         >>> try:
         ...     ps.load("nowhere.ply")
         ... except ps.SceneError as error:
-        ...     print(error)
-        nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog,
-        lod-meta.json, meta.json, \
-.splat), a checkpoint of Splatfacto or gsplat (.ckpt, .pt), or a Splatfacto run (its folder or
-config.yml)
+        ...     print(f"{str(error)[:58]} ...")
+        nowhere.ply: no such file; expected a scene (.compressed.p ...
     """
 
 

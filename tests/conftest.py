@@ -150,7 +150,7 @@ def some_lpips(request, monkeypatch) -> bool:
 def make_refined_run() -> Callable:
     """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved``
     to every opacity logit and nothing else, and gives its folder."""
-    from pointsplat_ns.refine import Refiner, preset
+    from pointsplat_ns.refinement import Refiner, preset
 
     def make(
         folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model

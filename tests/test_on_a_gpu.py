@@ -11,12 +11,12 @@ import pointsplat_ns as ps
 from making import box_room, dense_config, same, small_refiner
 from pointsplat_ns.pipeline import trained_refiner
 from pointsplat_ns.pipeline.repair import STEPS
-from pointsplat_ns.prune.merging import MERGING, Merger, merge, merge_levels, rounds
-from pointsplat_ns.prune.merging.rounds import one_round
-from pointsplat_ns.prune.methods import METHODS
-from pointsplat_ns.refine import save_refiner
-from pointsplat_ns.render.comparison.closeness import DenseReference
-from pointsplat_ns.render.comparison.each_view import each_view
+from pointsplat_ns.pruning.merging import MERGING, Merger, merge, merge_levels, rounds
+from pointsplat_ns.pruning.merging.rounds import one_round
+from pointsplat_ns.pruning.methods import METHODS
+from pointsplat_ns.refinement import save_refiner
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
+from pointsplat_ns.rendering.comparison.each_view import each_view
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.view_sampling.settings import changed

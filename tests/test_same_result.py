@@ -7,7 +7,7 @@ import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns.pipeline.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune.methods import METHODS
+from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.threads import fixed_threads
 

@@ -34,7 +34,7 @@ from lab.common.ways import count_of
 from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS, DenseViews, JudgedScene, check, check_options, known_rows, load
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.prune.merging import MERGING, MergeSettings, merge
+from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.system.files import replacing
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.view_sampling.settings import LOOKING, changed
@@ -76,7 +76,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "half_gain_coverage_1": dict(half_gain_coverage=1.0),
 }
 """For each rule the value that turns it off, or a value beside the default: fields of
-:class:`~pointsplat_ns.prune.merging.MergeSettings`."""
+:class:`~pointsplat_ns.pruning.merging.MergeSettings`."""
 
 POSES = "photos, poses given"
 """In place of a width: the poses of held-out photos, where merging is given those of the training

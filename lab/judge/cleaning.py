@@ -26,7 +26,7 @@ from lab.tables.scenes import Pictures
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.pipeline.cleaning import floating_scores
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
-from pointsplat_ns.render import render
+from pointsplat_ns.rendering import render
 from pointsplat_ns.system.tensors import normal_mode
 
 

@@ -19,7 +19,7 @@ from lab.common.scenes import name_of
 from lab.judge.camera_paths import path_of, views_of
 from pointsplat_ns.metrics import finite_psnr
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.render import render, render_with_alpha
+from pointsplat_ns.rendering import render, render_with_alpha
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.scene.views import Views

@@ -15,15 +15,15 @@ import pointsplat_ns as ps
 from lab.numerics.cases import HEIGHT, WIDTH, Case, Sweep
 from lab.numerics.reference import rasterize_reference
 from pointsplat_ns.geometry.neighbours import other_neighbours
-from pointsplat_ns.prune.merging import MERGING, merge
-from pointsplat_ns.prune.merging.pair_cost import pair_costs
-from pointsplat_ns.prune.merging.pairs import cheapest_pairs
-from pointsplat_ns.prune.merging.state import Participants, initial_state
-from pointsplat_ns.prune.paper import paper_score
-from pointsplat_ns.prune.view_scores import lightgaussian_score, pup_score
-from pointsplat_ns.refine import Refiner
-from pointsplat_ns.refine.refiner import gaussian_features
-from pointsplat_ns.render import rasterization
+from pointsplat_ns.pruning.merging import MERGING, merge
+from pointsplat_ns.pruning.merging.pair_cost import pair_costs
+from pointsplat_ns.pruning.merging.pairs import cheapest_pairs
+from pointsplat_ns.pruning.merging.state import Participants, initial_state
+from pointsplat_ns.pruning.paper import paper_score
+from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
+from pointsplat_ns.refinement import Refiner
+from pointsplat_ns.refinement.refiner import gaussian_features
+from pointsplat_ns.rendering import rasterization
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.view_sampling.content import content_size
 

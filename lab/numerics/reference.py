@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.geometry.transforms import SHORTEST
-from pointsplat_ns.render.constants import (
+from pointsplat_ns.rendering.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     COMPENSATION_MIN,
     FRUSTUM_MARGIN,
     TRANSMITTANCE_MIN,
 )
-from pointsplat_ns.render.spherical_harmonics import sh_basis
+from pointsplat_ns.rendering.spherical_harmonics import sh_basis
 from pointsplat_ns.scene.views import EPS2D
 from pointsplat_ns.system.tensors import FLAGS, FLOATS
 

@@ -175,7 +175,7 @@ def _with_zeros(header: bytes) -> bytes:
 def _refiner_metadata(folder: Path) -> Read:
     """The metadata of a refiner's safetensors file, whose tensors are as they should be."""
     from pointsplat_ns.pipeline.trained_refiner import load_refiner
-    from pointsplat_ns.refine import Refiner, RefinerConfig
+    from pointsplat_ns.refinement import Refiner, RefinerConfig
 
     sizes = {
         "grid": None,
@@ -313,7 +313,9 @@ def _use_replica(path: Path) -> object:
 READERS |= {
     "refiner-metadata": _refiner_metadata,
     "weights": at(
-        "a.safetensors", "pointsplat_ns.refine.feedback:read_feedback_refiner", inside=_with_zeros
+        "a.safetensors",
+        "pointsplat_ns.refinement.feedback:read_feedback_refiner",
+        inside=_with_zeros,
     ),
     "config": at("config.yml", _use_run, _run),
     "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.scene.runs:read_transforms"),

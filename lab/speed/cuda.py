@@ -34,8 +34,8 @@ from lab.common.printing import start
 from lab.common.timing import seconds_of
 from lab.rooms import write_room
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.render import rasterization
-from pointsplat_ns.render.rasterization import gsplat_works
+from pointsplat_ns.rendering import rasterization
+from pointsplat_ns.rendering.rasterization import gsplat_works
 from pointsplat_ns.system.threads import now
 
 SUPPORT = Path(__file__).parents[2] / "tests" / "support"

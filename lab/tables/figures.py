@@ -20,7 +20,7 @@ from lab.tables.making import Maker, Refiners, Tools
 from lab.tables.scenes import Options, open_scene
 from lab.tables.ways import PROTOCOL, WAYS
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.render import render
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import name_of
 

@@ -25,10 +25,10 @@ from lab.tables.ways import PROTOCOL, WAYS, Network, Way
 from pointsplat_ns.pipeline.optimiser import RATES, Adam, AdamSettings, optimised
 from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner, load_refiner
-from pointsplat_ns.prune import method_named, resolve_keep, score_of, select
-from pointsplat_ns.prune.paper import DEFAULT_OPACITY_WEIGHT
-from pointsplat_ns.refine import read_metadata
-from pointsplat_ns.render import render
+from pointsplat_ns.pruning import method_named, resolve_keep, score_of, select
+from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT
+from pointsplat_ns.refinement import read_metadata
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.scene.reading import source_file

@@ -28,9 +28,9 @@ from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.metrics import MOST_PSNR
-from pointsplat_ns.prune import ply_bytes
-from pointsplat_ns.render import render
-from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import source_file
 from pointsplat_ns.scene.runs import may_be_run, name_of, open_run

@@ -15,7 +15,7 @@ from lab.tables.ways import PROTOCOL
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
-from pointsplat_ns.prune import need_usable
+from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.scene.runs import Run, may_be_run, open_run

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from pointsplat_ns.prune.paper import DEFAULT_OPACITY_WEIGHT
+from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT
 
 
 @dataclass(frozen=True)

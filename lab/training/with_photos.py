@@ -37,7 +37,7 @@ from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.pipeline.options import PHOTO_STEPS
-from pointsplat_ns.render import render
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.scene.runs import METHOD_NAMES
 from pointsplat_ns.system.files import replacing

@@ -38,7 +38,7 @@ def convert(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.prune import cut_sh
+    from pointsplat_ns.pruning import cut_sh
 
     options.need_one_scene(scene)
     options.check_outputs(output, force)

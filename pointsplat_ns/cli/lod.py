@@ -102,7 +102,7 @@ def lod(
 
 def _print_table(made: Levels, folder: Path) -> None:
     from pointsplat_ns.pipeline.quality import word_for
-    from pointsplat_ns.prune import ply_bytes
+    from pointsplat_ns.pruning import ply_bytes
     from pointsplat_ns.scene.discovery import FOLDER_FILES
     from pointsplat_ns.system.files import bytes_text, three_digits
 

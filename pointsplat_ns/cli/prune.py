@@ -62,7 +62,7 @@ def prune(
     from pointsplat_ns.pipeline.prune_file import prune_file, rows_to_prune
     from pointsplat_ns.pipeline.quality import judge_of, quality_of_file
     from pointsplat_ns.pipeline.requests import Looking, prune_source
-    from pointsplat_ns.render.comparison.sizes import parse_resolution
+    from pointsplat_ns.rendering.comparison.sizes import parse_resolution
     from pointsplat_ns.scene.formats import format_to_write
     from pointsplat_ns.scene.ply import PlyRows
     from pointsplat_ns.system.progress import progress_bar

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.render.comparison.closeness import Closeness, DenseReference
-from pointsplat_ns.render.comparison.sizes import NEARER, RendersOfSizes, sides_of
+from pointsplat_ns.rendering.comparison.closeness import Closeness, DenseReference
+from pointsplat_ns.rendering.comparison.sizes import NEARER, RendersOfSizes, sides_of
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.progress import Progress, silent
 

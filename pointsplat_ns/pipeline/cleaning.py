@@ -25,10 +25,10 @@ from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
-from pointsplat_ns.render import pixel_sums, pixels_of, render, render_depth
-from pointsplat_ns.render.comparison.closeness import DenseReference, views_text
-from pointsplat_ns.render.comparison.each_view import each_view
-from pointsplat_ns.render.constants import ALPHA_MIN
+from pointsplat_ns.rendering import pixel_sums, pixels_of, render, render_depth
+from pointsplat_ns.rendering.comparison.closeness import DenseReference, views_text
+from pointsplat_ns.rendering.comparison.each_view import each_view
+from pointsplat_ns.rendering.constants import ALPHA_MIN
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system.progress import Progress, silent

@@ -23,7 +23,7 @@ from pointsplat_ns.pipeline.repair import repair
 from pointsplat_ns.pipeline.report import Compacted, Stage, last_kept
 from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.formats.rounding import ROUNDING, rounding_for
 from pointsplat_ns.scene.gaussians import Gaussians

@@ -19,7 +19,7 @@ from torch import Tensor
 from pointsplat_ns.metrics import PIXEL_LOSSES, SSIM_WINDOW, PixelLoss
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.pipeline.photos.examples import Example
-from pointsplat_ns.render import render
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import View
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
@@ -277,7 +277,7 @@ def gradients_of(
         view: the camera.
         target: (H, W, 3) target image in [0, 1].
         mask: (H, W, 1) bool, the pixels that count; None for all.
-        backend: the rasterizer, as for :func:`pointsplat_ns.render.render`.
+        backend: the rasterizer, as for :func:`pointsplat_ns.rendering.render`.
         pixel_loss: as for :func:`optimised`.
     """
     leaves = scene.map(lambda value: value.detach().requires_grad_())

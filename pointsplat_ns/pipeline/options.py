@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
-from pointsplat_ns.prune import (
+from pointsplat_ns.pruning import (
     Keep,
     Method,
     PruneSettings,
@@ -121,7 +121,7 @@ class PruneRequest:
     keep: Keep | str
     """Ratio, count, size of the file, or PSNR of renders against those of the dense scene."""
     by: str = "merge"
-    """One of :data:`~pointsplat_ns.prune.METHODS`."""
+    """One of :data:`~pointsplat_ns.pruning.METHODS`."""
     sh: str = "all"
     """"all" keeps the SH bands, a digit cuts them to that degree, "auto" cuts them to the lowest
     degree whose renders reach 40 dB against those with all bands."""

@@ -41,7 +41,7 @@ from pointsplat_ns.pipeline.photos.examples import (
 )
 from pointsplat_ns.pipeline.repair import OptimisationRun, rate_factor
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
-from pointsplat_ns.prune import prune
+from pointsplat_ns.pruning import prune
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views, spread_indices
 from pointsplat_ns.view_sampling.sampler import Sampler
@@ -235,7 +235,7 @@ def reallocated(scene: Gaussians, pull: Tensor, share: float, views: Views | Sam
         scene: K Gaussians; not changed.
         pull: (K,), those with the largest are split.
         share: of the Gaussians that are split, in [0, 1].
-        views: views that weigh errors of merging, as for :func:`pointsplat_ns.prune.prune`.
+        views: views that weigh errors of merging, as for :func:`pointsplat_ns.pruning.prune`.
 
     Returns:
         K Gaussians; ``scene`` if fewer than K are finite.

@@ -23,7 +23,7 @@ from pointsplat_ns.pipeline.cleaning import clean_scene
 from pointsplat_ns.pipeline.options import PruneRequest
 from pointsplat_ns.pipeline.quality import Judge, decibels, through_file
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
-from pointsplat_ns.prune import (
+from pointsplat_ns.pruning import (
     Megabytes,
     WithinPsnr,
     cut_sh,
@@ -32,8 +32,8 @@ from pointsplat_ns.prune import (
     score_of,
     select,
 )
-from pointsplat_ns.prune.merging import Merger, merge
-from pointsplat_ns.render.comparison.closeness import DenseReference, views_text
+from pointsplat_ns.pruning.merging import Merger, merge
+from pointsplat_ns.rendering.comparison.closeness import DenseReference, views_text
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.formats.rounding import rounding_for
 from pointsplat_ns.scene.gaussians import Gaussians

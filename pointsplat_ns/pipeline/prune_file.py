@@ -13,11 +13,11 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.pipeline.options import PruneRequest
 from pointsplat_ns.pipeline.photos.posed_scene import PosesFile, without_poses
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
-from pointsplat_ns.prune import found_by_trying
-from pointsplat_ns.prune.merging.by_cells import merge_file
-from pointsplat_ns.prune.merging.cells import Scratch
-from pointsplat_ns.prune.merging.settings import MERGING
-from pointsplat_ns.render.comparison.sizes import RESOLUTION
+from pointsplat_ns.pruning import found_by_trying
+from pointsplat_ns.pruning.merging.by_cells import merge_file
+from pointsplat_ns.pruning.merging.cells import Scratch
+from pointsplat_ns.pruning.merging.settings import MERGING
+from pointsplat_ns.rendering.comparison.sizes import RESOLUTION
 from pointsplat_ns.scene.formats import format_to_read
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import PlyRows, read_ply

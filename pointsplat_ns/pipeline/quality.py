@@ -3,7 +3,7 @@ pictures say in one text.
 
 Renders are compared in the views of :meth:`~pointsplat_ns.pipeline.view_provider.ViewSource.whole`, at the
 size that people look at, in few of their pixels. For PSNR these are every k-th
-(:mod:`~pointsplat_ns.render.comparison.sizes`). SSIM needs neighbours, so it takes bands of rows of each
+(:mod:`~pointsplat_ns.rendering.comparison.sizes`). SSIM needs neighbours, so it takes bands of rows of each
 view, at other heights in each.
 """
 
@@ -21,10 +21,10 @@ import torch
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune import ply_bytes
-from pointsplat_ns.render.comparison.closeness import DenseReference, views_text
-from pointsplat_ns.render.comparison.fill import fill
-from pointsplat_ns.render.comparison.sizes import subsampled
+from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.rendering.comparison.closeness import DenseReference, views_text
+from pointsplat_ns.rendering.comparison.fill import fill
+from pointsplat_ns.rendering.comparison.sizes import subsampled
 from pointsplat_ns.scene.formats import Format, format_to_write
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.usable import usable_part

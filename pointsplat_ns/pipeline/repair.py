@@ -20,8 +20,8 @@ from pointsplat_ns.pipeline.options import STEPS, Effort, RepairBudget
 from pointsplat_ns.pipeline.photos.examples import Example, render_of
 from pointsplat_ns.pipeline.repair_state import Unfinished
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
-from pointsplat_ns.refine.feedback import FeedbackRefiner, shipped_feedback_refiner
-from pointsplat_ns.render.comparison.sizes import SMALLEST_SIDE
+from pointsplat_ns.refinement.feedback import FeedbackRefiner, shipped_feedback_refiner
+from pointsplat_ns.rendering.comparison.sizes import SMALLEST_SIDE
 from pointsplat_ns.scene.gaussians import Gaussians
 
 __all__ = [
@@ -60,7 +60,7 @@ def repair(
     change.
 
     Each step renders both scenes in one view. A network reads the gradients of each Gaussian and
-    sets how far it moves (:mod:`~pointsplat_ns.refine.feedback`). The views come from
+    sets how far it moves (:mod:`~pointsplat_ns.refinement.feedback`). The views come from
     :meth:`ViewSource.others`: other views than those of comparisons, each once before any is
     repeated. Ctrl-C ends the repair, and the scene of the last step is returned.
 

@@ -9,7 +9,7 @@ from typing import Literal
 from pointsplat_ns.pipeline.acceptance import closer_in
 from pointsplat_ns.pipeline.photo_repair import PhotoRepaired
 from pointsplat_ns.pipeline.quality import Judge, PhotoGain
-from pointsplat_ns.render.comparison.closeness import Closeness, DenseReference
+from pointsplat_ns.rendering.comparison.closeness import Closeness, DenseReference
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.quantities import counted

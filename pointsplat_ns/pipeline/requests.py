@@ -18,8 +18,8 @@ from pointsplat_ns.pipeline.photos.posed_scene import (
 )
 from pointsplat_ns.pipeline.report import Compacted, last_kept
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
-from pointsplat_ns.prune import need_usable
-from pointsplat_ns.render.comparison.sizes import parse_resolution
+from pointsplat_ns.pruning import need_usable
+from pointsplat_ns.rendering.comparison.sizes import parse_resolution
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views, spread_indices
 from pointsplat_ns.system.progress import Progress, progress_bar

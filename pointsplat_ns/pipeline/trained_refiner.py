@@ -14,9 +14,9 @@ import torch
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.pipeline.options import default_device
-from pointsplat_ns.prune import PruneSettings, method_named
-from pointsplat_ns.refine import Refiner, WeightsError, preset, read_metadata, read_refiner
-from pointsplat_ns.refine.weights import SHIPPED_REFINER
+from pointsplat_ns.pruning import PruneSettings, method_named
+from pointsplat_ns.refinement import Refiner, WeightsError, preset, read_metadata, read_refiner
+from pointsplat_ns.refinement.weights import SHIPPED_REFINER
 from pointsplat_ns.scene.checkpoints import allow_splatfacto_checkpoints
 from pointsplat_ns.scene.discovery import find_runs_and_plys, shown_scene
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -63,7 +63,7 @@ def load_refiner(
     Args:
         path: a ``.safetensors`` file, or a ``pointsplat`` run (its folder, ``config.yml`` or
             checkpoint); by default or for "shipped" the one that ships
-            (``pointsplat_ns/refine/pretrained/CARD.md`` describes its training).
+            (``pointsplat_ns/refinement/pretrained/CARD.md`` describes its training).
         device: device of the network; by default CUDA if available, else the CPU.
 
     Raises:

@@ -10,7 +10,7 @@ from itertools import count as counted
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.render.comparison.sizes import (
+from pointsplat_ns.rendering.comparison.sizes import (
     RESOLUTION,
     SMALLEST_SIDE,
     middle_sized,
@@ -155,7 +155,7 @@ class ViewSource:
 
     def compared(self) -> Views:
         """The views in which renders are compared, at
-        :func:`~pointsplat_ns.render.comparison.sizes.middle_sized` size."""
+        :func:`~pointsplat_ns.rendering.comparison.sizes.middle_sized` size."""
         return middle_sized(self._whole)
 
     def scored(self, count: int) -> Views:
@@ -167,7 +167,7 @@ class ViewSource:
     ) -> Iterator[View]:
         """Views to optimise on, without end: none of the :meth:`compared` ones, in random order,
         each once before any is repeated. Each is subsampled from a picture of one of
-        :func:`~pointsplat_ns.render.comparison.sizes.several_sizes`, the next time of another.
+        :func:`~pointsplat_ns.rendering.comparison.sizes.several_sizes`, the next time of another.
 
         They are known views; if these are fewer than the compared ones, known and sampled ones in
         turn; if all known ones are compared, or there are none, sampled ones.

@@ -16,7 +16,7 @@ from pointsplat_ns.pipeline.cleaning import clusters
 from pointsplat_ns.pipeline.quality import Quality
 from pointsplat_ns.pipeline.report import Compacted
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
-from pointsplat_ns.render import render, render_with_alpha
+from pointsplat_ns.rendering import render, render_with_alpha
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views, spread_indices
 from pointsplat_ns.system.files import replacing

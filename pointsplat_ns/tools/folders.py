@@ -29,8 +29,8 @@ from pointsplat_ns.pipeline.options import CompactRequest, Effort, RepairBudget
 from pointsplat_ns.pipeline.quality import judge_of, quality_line, read_back
 from pointsplat_ns.pipeline.trained_refiner import load_refiner
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
-from pointsplat_ns.prune import Keep
-from pointsplat_ns.render.comparison.sizes import parse_resolution, size_text
+from pointsplat_ns.pruning import Keep
+from pointsplat_ns.rendering.comparison.sizes import parse_resolution, size_text
 from pointsplat_ns.scene.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.scene.formats import format_like, format_to_write
 from pointsplat_ns.scene.gaussians import Gaussians

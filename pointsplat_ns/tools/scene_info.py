@@ -15,10 +15,10 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune.sh_bands import band_energies
-from pointsplat_ns.render.comparison.fill import fill
-from pointsplat_ns.render.comparison.sizes import parse_resolution
-from pointsplat_ns.render.constants import ALPHA_MIN
+from pointsplat_ns.pruning.sh_bands import band_energies
+from pointsplat_ns.rendering.comparison.fill import fill
+from pointsplat_ns.rendering.comparison.sizes import parse_resolution
+from pointsplat_ns.rendering.constants import ALPHA_MIN
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import kind_of, read_scene, source_parts
 from pointsplat_ns.system.tensors import DOUBLES
@@ -54,7 +54,7 @@ class SceneInfo:
     up_is_guess: bool
     """Whether it was estimated without evidence that agrees."""
     fill: float | None
-    """Mean number of Gaussians drawn per pixel (:func:`pointsplat_ns.render.comparison.fill.fill`) in
+    """Mean number of Gaussians drawn per pixel (:func:`pointsplat_ns.rendering.comparison.fill.fill`) in
     sampled views; None if there are none."""
     views: str
     """Number and size of these views, as text."""

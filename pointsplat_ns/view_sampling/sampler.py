@@ -29,8 +29,8 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import curve_keys, invert_rigid, unit_cells
-from pointsplat_ns.render import pixels_of
-from pointsplat_ns.render.comparison.sizes import RESOLUTION
+from pointsplat_ns.rendering import pixels_of
+from pointsplat_ns.rendering.comparison.sizes import RESOLUTION
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.tensors import DOUBLES

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
-from pointsplat_ns.render.spherical_harmonics import sh_basis
+from pointsplat_ns.rendering.spherical_harmonics import sh_basis
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.pieces import in_pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import AXES, axis_along, direction_of, rotation_matrices
-from pointsplat_ns.render import pixels_of
+from pointsplat_ns.rendering import pixels_of
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.view_sampling.content import UNITS

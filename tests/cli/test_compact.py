@@ -15,8 +15,8 @@ from html_parts import parts_of
 from making import ball, same
 from pointsplat_ns.cli.compact import GOALS
 from pointsplat_ns.pipeline import quality
-from pointsplat_ns.prune import METHODS, prune
-from pointsplat_ns.refine import Refiner, preset, save_refiner
+from pointsplat_ns.pruning import METHODS, prune
+from pointsplat_ns.refinement import Refiner, preset, save_refiner
 from pointsplat_ns.scene.discovery import find_scenes
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import read_ply, write_ply

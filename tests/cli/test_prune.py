@@ -16,7 +16,7 @@ import pointsplat_ns as ps
 from killing import KILLED_AFTER_STEPS
 from making import ball, normal_scene, quick_start, run_of
 from pointsplat_ns.pipeline import prune_file
-from pointsplat_ns.prune import METHODS
+from pointsplat_ns.pruning import METHODS
 from pointsplat_ns.scene.ply import read_ply, write_ply
 from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.view_sampling.sampler import sample_views

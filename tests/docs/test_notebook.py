@@ -13,11 +13,11 @@ SMALLER = f"""
 import pointsplat_ns as ps
 from pointsplat_ns import api
 from pointsplat_ns.pipeline import repair
-from pointsplat_ns import view_source
+from pointsplat_ns.pipeline import view_provider
 from pointsplat_ns.view_sampling import settings
 
 ps.save(ps.example_room()[::30], "room.ply")
-api.EXAMPLE, repair.STEPS["quick"], view_source.RESOLUTION = "room.ply", 2, (64, 48)
+api.EXAMPLE, repair.STEPS["quick"], view_provider.RESOLUTION = "room.ply", 2, (64, 48)
 settings.changed({QUICK}).__enter__()
 """
 """Run before all cells: the scene that ships cut to a thirtieth, a repair of two steps, few and

@@ -8,7 +8,7 @@ import torch
 
 from lab import feedback_training
 from lab.feedback_training import FeedbackTrainingSettings, TrainingScene, roll_out, train_feedback
-from pointsplat_ns.refine.feedback import FeedbackRefiner, read_feedback_refiner
+from pointsplat_ns.refinement.feedback import FeedbackRefiner, read_feedback_refiner
 
 
 @pytest.fixture(scope="module")

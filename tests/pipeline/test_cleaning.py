@@ -22,8 +22,8 @@ from pointsplat_ns.pipeline.cleaning import (
 from pointsplat_ns.pipeline.options import PruneRequest
 from pointsplat_ns.pipeline.prune import prune_scene
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune import WithinPsnr, resolve_keep
-from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.pruning import WithinPsnr, resolve_keep
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.sampler import sample_views

@@ -17,10 +17,10 @@ from pointsplat_ns.pipeline.repair import Repaired
 from pointsplat_ns.pipeline.report import Compacted
 from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune import PruneSettings, prune
-from pointsplat_ns.refine import Refiner, RefinerConfig
-from pointsplat_ns.render.comparison.closeness import Closeness, DenseReference
-from pointsplat_ns.render.comparison.sizes import RendersOfSizes
+from pointsplat_ns.pruning import PruneSettings, prune
+from pointsplat_ns.refinement import Refiner, RefinerConfig
+from pointsplat_ns.rendering.comparison.closeness import Closeness, DenseReference
+from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.progress import silent

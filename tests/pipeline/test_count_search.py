@@ -18,8 +18,8 @@ from pointsplat_ns.pipeline.budget_search import (
 from pointsplat_ns.pipeline.options import PruneRequest
 from pointsplat_ns.pipeline.prune import prune_scene
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune import METHODS, WithinPsnr, score_of, select
-from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.pruning import METHODS, WithinPsnr, score_of, select
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats import Format, format_to_write
 from pointsplat_ns.scene.formats.rounding import rounding_for
 from pointsplat_ns.scene.formats.spz import encode_spz

@@ -8,8 +8,8 @@ import torch
 from making import assert_same_on_any_threads
 from pointsplat_ns.pipeline.feedback_features import REPAIR, Feedback
 from pointsplat_ns.pipeline.optimiser import Adam, AdamSettings, nonzero_rms
-from pointsplat_ns.prune import prune
-from pointsplat_ns.refine.feedback import FeedbackRefiner, shipped_feedback_refiner
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.refinement.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.scene.gaussians import PARAMETERS, Gaussians
 
 

@@ -37,8 +37,8 @@ from pointsplat_ns.pipeline.photo_repair import photo_repair, reallocated, split
 from pointsplat_ns.pipeline.photos import examples
 from pointsplat_ns.pipeline.photos.examples import every_kth_pixel, mean_psnr
 from pointsplat_ns.pipeline.quality import through_file
-from pointsplat_ns.prune import prune
-from pointsplat_ns.render import render
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.views import EPS2D
 from pointsplat_ns.view_sampling.sampler import sample_views
 

@@ -8,8 +8,8 @@ from making import ball, same
 from pointsplat_ns.pipeline.options import PruneRequest
 from pointsplat_ns.pipeline.prune import Pruned, prune_scene
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune import METHODS, Keep, WithinPsnr, select
-from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.pruning import METHODS, Keep, WithinPsnr, select
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats.spz import encode_spz
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views

@@ -16,8 +16,8 @@ from pointsplat_ns.pipeline.quality import (
     through_file,
 )
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.render.comparison.closeness import DenseReference
-from pointsplat_ns.render.comparison.fill import fill
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
+from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.reading import save
 from pointsplat_ns.view_sampling.sampler import sample_views
 

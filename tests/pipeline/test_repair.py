@@ -26,9 +26,9 @@ from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.pipeline.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.pipeline.repair_state import Unfinished
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
-from pointsplat_ns.prune import prune
-from pointsplat_ns.render import render
-from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.pruning import prune
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.view_sampling.sampler import sample_views
 from pointsplat_ns.view_sampling.settings import changed

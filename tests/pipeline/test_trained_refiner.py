@@ -10,8 +10,8 @@ import pointsplat_ns as ps
 from making import normal_scene, small_refiner
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.pipeline.trained_refiner import load_refiner, open_refiner_run, scenes_of_run
-from pointsplat_ns.prune import PruneSettings, prune
-from pointsplat_ns.refine import WeightsError, save_refiner
+from pointsplat_ns.pruning import PruneSettings, prune
+from pointsplat_ns.refinement import WeightsError, save_refiner
 
 
 @pytest.mark.parametrize(

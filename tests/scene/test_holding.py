@@ -11,7 +11,7 @@ import torch
 import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.render.spherical_harmonics import sh_basis
+from pointsplat_ns.rendering.spherical_harmonics import sh_basis
 from pointsplat_ns.scene.formats import FORMATS
 from pointsplat_ns.scene.formats.capacity import FLOAT, seen_colours, within_colours
 from pointsplat_ns.scene.formats.coding import morton_order

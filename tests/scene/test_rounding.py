@@ -14,7 +14,7 @@ import pointsplat_ns as ps
 from making import cloud, same_bits, splats
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.prune.merging.covariance import covariances, unpack
+from pointsplat_ns.pruning.merging.covariance import covariances, unpack
 from pointsplat_ns.scene import ply
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.formats.palette import codebook

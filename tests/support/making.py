@@ -137,7 +137,7 @@ EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])
 def photographed(n: int = 600, degree: int = 3, eyes: torch.Tensor = EYES) -> Gaussians:
     """A ball whose SH were moved along the basis in the directions that eyes see it from, by random
     steps."""
-    from pointsplat_ns.render.spherical_harmonics import sh_basis
+    from pointsplat_ns.rendering.spherical_harmonics import sh_basis
 
     scene = ball(n, degree)
     generator = torch.Generator().manual_seed(1)
@@ -199,7 +199,7 @@ def camera_askew(
 def small_refiner(trained: bool = True, seed: int = 0, **changes):
     """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that
     residuals are not zero."""
-    from pointsplat_ns.refine import Refiner, preset
+    from pointsplat_ns.refinement import Refiner, preset
 
     sizes = {
         "strides": (2,),

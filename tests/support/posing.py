@@ -7,7 +7,7 @@ import numpy as np
 from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
 from pointsplat_ns.geometry.transforms import invert_rigid, viewmats_to_opengl
-from pointsplat_ns.render import render
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import write_picture
 from pointsplat_ns.scene.views import Views

@@ -10,8 +10,8 @@ import torch
 import pointsplat_ns as ps
 from making import box_room, move_zero_layers
 from pointsplat_ns.pipeline import repair
-from pointsplat_ns.prune.methods import METHODS
-from pointsplat_ns.refine import Refiner, preset, save_refiner
+from pointsplat_ns.pruning.methods import METHODS
+from pointsplat_ns.refinement import Refiner, preset, save_refiner
 from pointsplat_ns.system.threads import fixed_threads
 
 

@@ -10,7 +10,7 @@ from foreign import write_sog_folder
 import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.render.comparison.fill import fill
+from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.view_sampling.upright import up_named
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from making import ball, box_room, splats
-from pointsplat_ns.render import render
-from pointsplat_ns.render.comparison.fill import fill
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.content import content_size, in_units, thinned

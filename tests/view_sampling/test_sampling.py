@@ -9,7 +9,7 @@ from upright_scenes import TURNS, room, tower, turned
 
 from making import ball, box_room, splats
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.render import pixels_of, render
+from pointsplat_ns.rendering import pixels_of, render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling import sampler as sampling

@@ -16,8 +16,8 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
-from pointsplat_ns.render import render
-from pointsplat_ns.render.comparison.sizes import RESOLUTION, subsampled
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.sizes import RESOLUTION, subsampled
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import in_unit_range
 from pointsplat_ns.scene.reading import read_scene

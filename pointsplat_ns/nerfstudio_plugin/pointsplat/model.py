@@ -25,9 +25,9 @@ from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.pipeline.trained_refiner import network_options
-from pointsplat_ns.prune import PruneSettings
-from pointsplat_ns.refine import Refiner, Structure, preset
-from pointsplat_ns.refine.augmentation import random_transform
+from pointsplat_ns.pruning import PruneSettings
+from pointsplat_ns.refinement import Refiner, Structure, preset
+from pointsplat_ns.refinement.augmentation import random_transform
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import in_unit_range
 

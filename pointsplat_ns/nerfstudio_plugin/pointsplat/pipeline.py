@@ -28,7 +28,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import (
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import evaluate_scene, only_finite
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
 from pointsplat_ns.pipeline.trained_refiner import network_options
-from pointsplat_ns.refine import save_refiner
+from pointsplat_ns.refinement import save_refiner
 from pointsplat_ns.scene.runs import RUN_FILES
 from pointsplat_ns.system import processes
 

@@ -41,7 +41,7 @@ from pointsplat_ns.nerfstudio_plugin.cameras import (
     RasterizerOptions,
     need_pinhole,
 )
-from pointsplat_ns.render.rasterization import Colors
+from pointsplat_ns.rendering.rasterization import Colors
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.metrics import MOST_PSNR, psnr_of
-from pointsplat_ns.render import render
-from pointsplat_ns.render.comparison.sizes import RESOLUTION, sides_of
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.sizes import RESOLUTION, sides_of
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import in_unit_range
 from pointsplat_ns.scene.views import View

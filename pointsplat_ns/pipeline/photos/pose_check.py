@@ -21,8 +21,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.metrics import MOST_PSNR, psnr_of
-from pointsplat_ns.render import pixels_of, render
-from pointsplat_ns.render.constants import ALPHA_MIN
+from pointsplat_ns.rendering import pixels_of, render
+from pointsplat_ns.rendering.constants import ALPHA_MIN
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import in_unit_range
 from pointsplat_ns.scene.views import View, Views

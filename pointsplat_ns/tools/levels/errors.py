@@ -9,8 +9,8 @@ from dataclasses import replace
 import torch
 from torch.nn.functional import avg_pool2d
 
-from pointsplat_ns.render import render_depth
-from pointsplat_ns.render.comparison.closeness import Reference
+from pointsplat_ns.rendering import render_depth
+from pointsplat_ns.rendering.comparison.closeness import Reference
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.tensors import DOUBLES
 

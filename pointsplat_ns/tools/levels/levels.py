@@ -27,9 +27,9 @@ from pointsplat_ns.pipeline.prune import prune_scene
 from pointsplat_ns.pipeline.quality import Judge, Quality
 from pointsplat_ns.pipeline.report import Stage, stage_text
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune import Keep, found_by_trying, need_usable, parse_keep, resolve_keep
-from pointsplat_ns.prune.merging import merge_levels
-from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.pruning import Keep, found_by_trying, need_usable, parse_keep, resolve_keep
+from pointsplat_ns.pruning.merging import merge_levels
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats.capacity import typical_sizes
 from pointsplat_ns.scene.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.scene.gaussians import Gaussians, Traits

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.prune.merging import merge_levels
+from pointsplat_ns.pruning.merging import merge_levels
 from pointsplat_ns.scene.formats import format_named
 from pointsplat_ns.scene.formats.rad import MOST_CHILDREN, encode_rad
 from pointsplat_ns.scene.gaussians import Gaussians

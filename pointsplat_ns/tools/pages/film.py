@@ -13,7 +13,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
-from pointsplat_ns.render import render
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.tools.pages.image_encoding import to_uint8, with_labels

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
-from pointsplat_ns.prune import need_usable
+from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.scene.formats.spz import encode_spz
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views

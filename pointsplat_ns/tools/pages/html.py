@@ -19,7 +19,7 @@ def _environment() -> Environment:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("pointsplat_ns", "pages/templates"),
+        loader=PackageLoader("pointsplat_ns", "tools/pages/templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.prune import need_usable
+from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.files import logger, replacing

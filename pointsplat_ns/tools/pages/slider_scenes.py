@@ -12,9 +12,9 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune import need_usable, resolve_keep, select
-from pointsplat_ns.prune.baselines import coverage_score
-from pointsplat_ns.prune.merging import Merger
+from pointsplat_ns.pruning import need_usable, resolve_keep, select
+from pointsplat_ns.pruning.baselines import coverage_score
+from pointsplat_ns.pruning.merging import Merger
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.usable import keep_usable
 from pointsplat_ns.system.files import one_line

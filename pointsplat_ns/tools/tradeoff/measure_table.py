@@ -14,8 +14,8 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
 from pointsplat_ns.pipeline.quality import decibels, word_for
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
-from pointsplat_ns.prune import Keep, method_named, parse_keep, resolve_keep
-from pointsplat_ns.render import render
+from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import name_of
 from pointsplat_ns.scene.views import spread_indices

@@ -23,9 +23,9 @@ from pointsplat_ns.metrics import SSIM_WINDOW, ssim
 from pointsplat_ns.pipeline.photos.examples import Example, Photos
 from pointsplat_ns.pipeline.quality import Judge
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
-from pointsplat_ns.prune import need_usable, ply_bytes
-from pointsplat_ns.render import render
-from pointsplat_ns.render.comparison.sizes import middle_sized
+from pointsplat_ns.pruning import need_usable, ply_bytes
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.sizes import middle_sized
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import in_unit_range
 from pointsplat_ns.scene.views import View, Views, spread_indices

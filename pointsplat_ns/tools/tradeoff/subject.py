@@ -23,7 +23,7 @@ from pointsplat_ns.pipeline.photos.posed_scene import (
 )
 from pointsplat_ns.pipeline.prune import prune_scene
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.render.comparison.sizes import parse_resolution, size_text
+from pointsplat_ns.rendering.comparison.sizes import parse_resolution, size_text
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import may_be_run, name_of
 from pointsplat_ns.system.progress import Progress

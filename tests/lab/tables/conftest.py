@@ -13,8 +13,8 @@ from lab.tables.measure import measure_tables
 from making import box_room
 from pointsplat_ns.pipeline import repair
 from pointsplat_ns.pipeline import view_provider as view_source
-from pointsplat_ns.refine import Refiner, preset
-from pointsplat_ns.refine.weights import save_refiner
+from pointsplat_ns.refinement import Refiner, preset
+from pointsplat_ns.refinement.weights import save_refiner
 
 
 @pytest.fixture(scope="session")

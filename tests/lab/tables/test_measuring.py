@@ -13,7 +13,7 @@ from lab.tables.ways import WAYS, Ways
 from making import box_room
 from peers import peer
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.render.comparison.closeness import DenseReference
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 
 
 def cells_of(tables) -> dict:

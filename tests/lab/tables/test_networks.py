@@ -12,8 +12,8 @@ from lab.tables.networks import jobs
 from lab.tables.ways import WAYS
 from making import box_room, write_run
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.refine import Refiner, preset
-from pointsplat_ns.refine.weights import save_refiner
+from pointsplat_ns.refinement import Refiner, preset
+from pointsplat_ns.refinement.weights import save_refiner
 
 NUMBER = {job.name: f"{number}/16" for number, job in enumerate(jobs(), 1)}
 """Shards of one network each."""

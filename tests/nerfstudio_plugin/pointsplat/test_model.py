@@ -22,8 +22,8 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.metrics import PIXEL_LOSSES
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import VARIANTS, print_summary
-from pointsplat_ns.prune import METHODS, score_of, select
-from pointsplat_ns.render import rasterization
+from pointsplat_ns.pruning import METHODS, score_of, select
+from pointsplat_ns.rendering import rasterization
 from pointsplat_ns.scene.gaussians import PARAMETERS
 from pointsplat_ns.scene.ply import read_ply
 from pointsplat_ns.scene.runs import open_run

@@ -13,8 +13,8 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch loa
 from making import equal, small_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
 from pointsplat_ns.pipeline.trained_refiner import load_refiner
-from pointsplat_ns.refine import Refiner
-from pointsplat_ns.refine.weights import read_metadata
+from pointsplat_ns.refinement import Refiner
+from pointsplat_ns.refinement.weights import read_metadata
 from pointsplat_ns.scene.runs import RUN_FILES
 
 PRESETS = {"paper": paper_config, "authors": authors_config}

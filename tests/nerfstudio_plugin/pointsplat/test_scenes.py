@@ -19,7 +19,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, dataparser_of
-from pointsplat_ns.render import render
+from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.scene.runs import open_run
 from pointsplat_ns.scene.views import EPS2D, Views

@@ -15,8 +15,8 @@ from broken_steps import broken
 from making import dense_config, equal, move_zero_layers, small_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import MODEL_METADATA
-from pointsplat_ns.refine import read_refiner
-from pointsplat_ns.refine.weights import read_metadata
+from pointsplat_ns.refinement import read_refiner
+from pointsplat_ns.refinement.weights import read_metadata
 from pointsplat_ns.scene.runs import RUN_FILES
 
 

@@ -21,7 +21,7 @@ from pointsplat_ns.pipeline import view_provider as view_source
 from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.pipeline.repair import Repaired
 from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.prune import ply_bytes
+from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tools.tradeoff import measure_table as table
 from pointsplat_ns.tools.tradeoff import measuring
 from pointsplat_ns.tools.tradeoff.measure_table import settings_of

@@ -1,0 +1,247 @@
+"""A scene that is larger than memory, in cells: parts of a space-filling curve with equally many
+Gaussians.
+
+Each cell has a file of its own, in a folder of finished steps.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.geometry.transforms import Cube, bulk_cube, curve_keys, unit_cells
+from pointsplat_ns.pruning.merging.state import drawable, sampled_step
+from pointsplat_ns.rendering.constants import ALPHA_MIN
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply import PlyRows
+from pointsplat_ns.scene.usable import usable_part
+from pointsplat_ns.system.files import (
+    logger,
+    one_line,
+    read_text,
+    require_space,
+    write_json,
+    write_tensors,
+)
+from pointsplat_ns.system.tensors import INDICES
+
+ROWS_AT_ONCE = 1 << 17
+"""Number of rows that are read at once."""
+
+
+class Scratch:
+    """A folder whose files are complete, or not there.
+
+    Args:
+        folder: it is created. If it holds steps of other work, these are removed.
+        work: description of the work, as JSON has it: all that its steps depend on.
+        size: bytes of all steps together; they must be free for new work.
+
+    Raises:
+        SceneError: if the folder cannot be used, or the disk has no room for it.
+    """
+
+    def __init__(self, folder: Path, work: Mapping[str, object], size: int = 0):
+        self.folder = folder
+        known = folder / "work.json"
+        try:
+            same = known.is_file() and json.loads(read_text(known)) == work
+        except ValueError:
+            same = False
+        try:
+            if not same and folder.exists():
+                shutil.rmtree(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SceneError(
+                f"{folder}: cannot be used ({error.strerror or one_line(error)})"
+            ) from error
+        if not same:
+            require_space(folder, folder, size)
+            write_json(work, known)
+
+    def has(self, name: str) -> bool:
+        """Whether a step was taken that gave tensors."""
+        return self._path(name).is_file()
+
+    def make(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> None:
+        """Take a step that gives tensors, unless it was taken before."""
+        if not self.has(name):
+            write_tensors(self._path(name), make(), {})
+
+    def tensors(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
+        """The tensors of a step, which is taken if it was not before."""
+        self.make(name, make)
+        return self.known(name)
+
+    def known(self, name: str) -> dict[str, Tensor]:
+        """The tensors of a step that was taken. Raises SceneError if its file is gone or
+        damaged."""
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+
+        try:
+            return load_file(self._path(name))
+        except (OSError, SafetensorError) as error:
+            raise SceneError(
+                f"{self.folder}: damaged ({one_line(error)}); remove it and start again"
+            ) from error
+
+    def drop(self, name: str) -> None:
+        """Remove the tensors of a step, if they are there."""
+        self._path(name).unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A scene in cells."""
+
+    scratch: Scratch
+    kind: Gaussians  # [0] with the widths and the traits of all
+    cube: Cube
+    """What the curve fills."""
+    counts: tuple[int, ...]
+    """Number of Gaussians in each cell."""
+    drawable: tuple[int, ...]
+    """Number of those that are not too faint to be drawn."""
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians in all cells."""
+        return sum(self.counts)
+
+    def read(self, cell: int) -> Gaussians:
+        """The Gaussians of a cell, in the order of the file."""
+        path = self.scratch.folder / _name(cell)
+        widths = [values.flatten(1).shape[1] for values in self.kind.tensors()]
+        scene = self.kind.map(lambda values: values.new_empty(self.counts[cell], *values.shape[1:]))
+        with path.open("rb") as stream:
+            for start in range(0, len(scene), ROWS_AT_ONCE):
+                count = min(ROWS_AT_ONCE, len(scene) - start)
+                table = np.fromfile(stream, "<f4", count * sum(widths))
+                if len(table) < count * sum(widths):
+                    raise SceneError(f"{path}: truncated; remove the folder and start again")
+                columns = torch.from_numpy(table.reshape(count, -1).astype(np.float32, copy=False))
+                for (_, into), values in zip(
+                    scene.items(), columns.split(widths, dim=1), strict=True
+                ):
+                    into[start : start + count] = values.reshape(count, *into.shape[1:])
+        return scene
+
+    def members(self, cell: int, k: int) -> tuple[Gaussians, Tensor]:
+        """The Gaussians of a cell, and the indices (n,) of those that are merged where all together
+        become ``k``, along the curve."""
+        scene = self.read(cell)
+        members = drawable(scene, self.share(cell, k))
+        keys = [
+            curve_keys(unit_cells(scene.means[some], self.cube))
+            for some in members.split(ROWS_AT_ONCE)
+        ]
+        return scene, members[torch.cat(keys).argsort(stable=True)]
+
+    def starts(self, k: int) -> list[int]:
+        """How many members are in all cells before each, and in all."""
+        counts = (max(count, self.share(cell, k)) for cell, count in enumerate(self.drawable))
+        return [0, *itertools.accumulate(counts)]
+
+    def share(self, cell: int, k: int) -> int:
+        """The share of a cell in ``k`` Gaussians."""
+        return -(-self.counts[cell] * k // self.count)
+
+
+def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float], None]) -> Cells:
+    """Write a file of each cell.
+
+    Args:
+        rows: the scene. Gaussians that cannot be drawn are dropped, and counted in a warning.
+        most: largest number of Gaussians in a cell, about.
+        scratch: where files are.
+        report: called with the share done.
+
+    Raises:
+        SceneError: if the file cannot be read, or no Gaussian of the sample can be drawn.
+    """
+    picked = range(0, rows.count, sampled_step(rows.count))
+    some = rows.pick(picked)
+    usable = some.usable()
+    if not bool(usable.any()):
+        raise SceneError(
+            f"{rows.path}: none of {len(some)} Gaussians in it can be drawn: all have NaN or "
+            "infinite values"
+        )
+    numbers = torch.tensor(picked, **INDICES)[usable]
+    some = usable_part(some)
+    cube = bulk_cube(some.means[drawable(some, 1)])
+    keys = curve_keys(unit_cells(some.means, cube))
+    places = _places(keys, numbers, rows.count).sort().values
+    cells = -(-rows.count // most)
+    borders = places[torch.arange(1, cells, **INDICES) * len(places) // cells]
+
+    def write() -> dict[str, Tensor]:
+        counts, clear = torch.zeros(2, cells, **INDICES)
+        with ExitStack() as stack:
+            files = [
+                stack.enter_context((scratch.folder / _name(cell)).open("wb"))
+                for cell in range(cells)
+            ]
+            for start in range(0, rows.count, ROWS_AT_ONCE):
+                piece = rows.read(start, min(start + ROWS_AT_ONCE, rows.count))
+                numbers = torch.arange(start, start + len(piece), **INDICES)[piece.usable()]
+                piece = usable_part(piece)
+                own = curve_keys(unit_cells(piece.means, cube))
+                cell = torch.searchsorted(borders, _places(own, numbers, rows.count), right=True)
+                table = torch.cat([values.flatten(1) for values in piece.tensors()], dim=1)
+                sizes = torch.bincount(cell, minlength=cells)
+                counts += sizes
+                clear += torch.bincount(cell[piece.alphas >= ALPHA_MIN], minlength=cells)
+                parts = table[cell.argsort(stable=True)].split(sizes.tolist())
+                for file, part in zip(files, parts, strict=True):
+                    part.numpy().astype("<f4", copy=False).tofile(file)
+                report(min(1.0, (start + ROWS_AT_ONCE) / rows.count))
+        dropped = rows.count - int(counts.sum())
+        if dropped:
+            logger.warning(
+                "%s: dropped %d of %d Gaussians with NaN or infinite values",
+                rows.path,
+                dropped,
+                rows.count,
+            )
+        return {"counts": counts, "drawable": clear}
+
+    counts = scratch.tensors("counts", write)
+    return Cells(
+        scratch,
+        some[:0].map(torch.clone),
+        cube,
+        *(tuple(counts[name].tolist()) for name in ("counts", "drawable")),
+    )
+
+
+def _places(keys: Tensor, numbers: Tensor, count: int) -> Tensor:
+    """Places (n,) int64 on the curve, from keys on the curve and the numbers of ``count`` rows. The
+    last 21 bits hold the order in the file, so that Gaussians at one position can be parted too."""
+    return ((keys >> 18) << 21) | (numbers * (1 << 21) // count)
+
+
+def _name(cell: int) -> str:
+    return f"cell_{cell:04d}.rows"

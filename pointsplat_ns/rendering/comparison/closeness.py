@@ -1,0 +1,144 @@
+"""Compares renders of a smaller scene with renders of the dense scene. No photos are needed.
+
+Every PSNR against the dense scene counts all squared error, halos included, over the pixels that
+the dense scene covers (:func:`~pointsplat_ns.metrics.psnr_of`), so that empty background does not
+make it better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.metrics import psnr_of
+from pointsplat_ns.metrics.structural_similarity import mean_ssim
+from pointsplat_ns.rendering import render_with_alpha
+from pointsplat_ns.rendering.comparison.each_view import each_view
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
+
+
+@dataclass(frozen=True)
+class Closeness:
+    """Errors of a scene's renders against those of the dense scene."""
+
+    errors: tuple[float, ...]
+    """Mean squared error over all pixels of each view."""
+    covered: tuple[float, ...]
+    """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
+    width: int | None = None
+    """Width of the pictures, pixels; None if it is not known."""
+
+    @property
+    def where(self) -> str:
+        """Text: the number of views, and their width."""
+        return views_text(len(self.errors)) + (
+            "" if self.width is None else f" of {self.width} pixels"
+        )
+
+    @property
+    def psnr(self) -> float:
+        """PSNR over the pixels that the dense scene covers in all views, dB; inf if nothing
+        differs."""
+        return psnr_of(sum(self.errors) / len(self.errors), sum(self.covered) / len(self.covered))
+
+    @property
+    def worst(self) -> float:
+        """PSNR of the worst view, dB."""
+        return min(map(psnr_of, self.errors, self.covered))
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Pictures of the dense scene, with which renders of other scenes are compared."""
+
+    views: Views
+    """C views."""
+    renders: list[Tensor]
+    """C pictures (H, W, 3)."""
+    covered: tuple[float, ...]
+    """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
+    alphas: list[Tensor] | None = None
+    """C alpha pictures (H, W, 1), for errors over two backgrounds; None for errors over the views'
+    own."""
+
+    def psnr(
+        self, scene: Gaussians, progress: Callable[[float], None] | None = None
+    ) -> tuple[float, float]:
+        """PSNR over all views, and of the worst view, dB; see :class:`Closeness`."""
+        close = self.closeness(scene, progress)
+        return close.psnr, close.worst
+
+    def closeness(
+        self, scene: Gaussians, progress: Callable[[float], None] | None = None
+    ) -> Closeness:
+        """Errors of a scene; ``progress`` is called with the share of the views done."""
+        return self._closeness(_drawn(scene, self.views), progress)
+
+    def closeness_of(self, images: Iterable[Tensor]) -> Closeness:
+        """Errors of C pictures (H, W, 3) over the views' own background."""
+        return self._closeness(((image, None) for image in images), None)
+
+    @torch.no_grad()
+    def ssim(self, scene: Gaussians) -> float:
+        """SSIM of a scene, mean over the views. Views must not be smaller than its window."""
+        total = 0.0
+        for (image, _), target in zip(_drawn(scene, self.views), self.renders, strict=True):
+            total += float(
+                mean_ssim(image.permute(2, 0, 1)[None], target.to(image).permute(2, 0, 1)[None])
+            )
+        return total / len(self.renders)
+
+    @torch.no_grad()
+    def _closeness(
+        self,
+        pictures: Iterable[tuple[Tensor, Tensor | None]],
+        progress: Callable[[float], None] | None,
+    ) -> Closeness:
+        """Errors of images, with their alpha where :attr:`alphas` are compared, too."""
+        errors: list[float] = []
+        for index, ((image, alpha), target) in enumerate(zip(pictures, self.renders, strict=True)):
+            apart = image.double() - target.double()
+            error = float(apart.square().mean())
+            if self.alphas is not None and alpha is not None:
+                other = (1 - 2 * self.views.background).to(
+                    apart
+                )  # from a background to its opposite
+                over_other = apart - (alpha - self.alphas[index]).double() * other
+                error = 0.5 * (error + float(over_other.square().mean()))
+            errors.append(error)
+            if progress is not None:
+                progress(len(errors) / len(self.renders))
+        return Closeness(tuple(errors), self.covered, self.views.width)
+
+
+class DenseReference(Reference):
+    """Renders of the dense scene.
+
+    Args:
+        dense: N Gaussians.
+        views: C views.
+        both_backgrounds: errors are means over two backgrounds, the views' own and its opposite
+            (white for black): the viewer's background is unknown, and a scene that fits one may be
+            too transparent or too opaque for the other.
+    """
+
+    @torch.no_grad()
+    def __init__(self, dense: Gaussians, views: Views, both_backgrounds: bool = False):
+        drawn = list(_drawn(dense, views))
+        covered = tuple(float(alpha.double().mean()) for _, alpha in drawn)
+        alphas = [alpha for _, alpha in drawn] if both_backgrounds else None
+        super().__init__(views, [image for image, _ in drawn], covered, alphas)
+
+
+def _drawn(scene: Gaussians, views: Views) -> Iterator[tuple[Tensor, Tensor]]:
+    """Image (H, W, 3) and alpha (H, W, 1) of each view."""
+    return each_view(scene, views, render_with_alpha)
+
+
+def views_text(count: int) -> str:
+    """A number of views in words: "1 view", "3 views"."""
+    return f"{count} view{'s' if count != 1 else ''}"

@@ -1,0 +1,186 @@
+"""Blending by compiled kernels (``blending.cpp``), as :mod:`~pointsplat_ns.rendering.blocks` does
+it in torch."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.rendering.alpha import CLAMPED
+from pointsplat_ns.rendering.constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from pointsplat_ns.rendering.ellipses import Grid, TileList
+from pointsplat_ns.rendering.quadratics import MOMENTS, PIXELS
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
+from pointsplat_ns.system.tensors import FLOATS, INDICES
+
+
+class KernelTape(NamedTuple):
+    """Results of the forward pass that the backward pass needs."""
+
+    before: Tensor  # [chunks, 64] transmittance in front of each chunk of a tile's list
+    blended: Tensor  # [tiles] int64, Gaussians passed before all pixels were finished
+    chunks: Tensor  # [tiles + 1] int64, where each tile's chunks start
+
+
+def inputs_of(
+    means2d: Tensor,
+    cov2d: Tensor,
+    det: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    _alpha_min: float,
+) -> Tensor:
+    """Table of projected Gaussians as the kernels read them, (M, 6 + D): geometry, then the colours
+    (M, D)."""
+    count, channels = colors.shape
+    tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
+    table = colors.new_empty(count, 6 + channels)
+    on_threads(
+        count >= SEVERAL, KERNELS.library.pointsplat_tabulate, *tensors, count, channels, table
+    )
+    return table
+
+
+def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list[Tensor]:
+    """As :func:`~pointsplat_ns.rendering.quadratics.chain`."""
+    count = len(summed)
+    cov2d = cov2d.contiguous()
+    det = det.contiguous()
+    opacities = opacities.contiguous()
+    grads = [
+        det.new_empty(count, 2),
+        torch.empty_like(cov2d),
+        torch.empty_like(det),
+        torch.empty_like(opacities),
+    ]
+    on_threads(
+        count >= SEVERAL,
+        KERNELS.library.pointsplat_chain,
+        summed.data_ptr(),
+        summed.stride(0),
+        cov2d,
+        det,
+        opacities,
+        count,
+        *grads,
+    )
+    return grads
+
+
+def task_of(
+    table: Tensor, grid: Grid, gaussians: Tensor, offsets: Tensor, chunks: Tensor, top: int = 0
+) -> Struct:
+    """The task of drawing some rows of tiles, without its output.
+
+    Args:
+        table: of :func:`inputs_of`.
+        grid: of the image.
+        gaussians: (P,) int64, rows of the table, by tile and front to back.
+        offsets: (tiles + 1,) int64, where those of each tile start.
+        chunks: (tiles + 1,) int64, where the chunks of each tile start; any where no tape is kept.
+        top: the first row of tiles.
+    """
+    return KERNELS.structs["Task"](
+        table=table,
+        gaussians=gaussians,
+        offsets=offsets,
+        chunks=chunks,
+        tiles=offsets.numel() - 1,
+        columns=grid.columns,
+        top=top,
+        width=grid.width,
+        height=grid.height,
+        channels=table.shape[1] - 6,
+        log2_alpha_min=math.log2(grid.alpha_min),
+        alpha_min=grid.alpha_min,
+        alpha_max=ALPHA_MAX,
+        clamped_from=CLAMPED,
+        transmittance_min=TRANSMITTANCE_MIN,
+    )
+
+
+def blend_region(
+    grid: Grid, tiles: TileList, table: Tensor, image: Tensor, final: Tensor, keep_tape: bool
+) -> KernelTape | None:
+    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape
+    if it is wanted."""
+    library = KERNELS.library
+    size = library.pointsplat_chunk()
+    chunks = torch.zeros_like(tiles.offsets)
+    torch.cumsum(
+        (tiles.offsets.diff() + (size - 1)).div_(size, rounding_mode="floor"), 0, out=chunks[1:]
+    )
+    before = image.new_empty(int(chunks[-1]) if keep_tape else 0, PIXELS)
+    blended = torch.empty_like(tiles.offsets[1:])
+    task = task_of(table, grid, tiles.gaussians, tiles.offsets, chunks, tiles.top)
+    task.fill(
+        image=image,
+        final_=final,
+        blended=blended,
+        before=before if keep_tape and len(before) else None,
+    )
+    on_threads(tiles.gaussians.numel() >= SEVERAL, library.pointsplat_blend, task)
+    return KernelTape(before, blended, chunks) if keep_tape else None
+
+
+def weigh(task: Struct, pairs: Tensor, count: int) -> Tensor:
+    """Blending weight of each of ``count`` Gaussians, summed over pixels, (count,). The table of
+    the task is without colours; ``pairs`` (P,) are rows of it."""
+    sums = torch.empty(pairs.numel(), **FLOATS)
+    task.fill(sums=sums)
+    on_threads(len(sums) >= SEVERAL, KERNELS.library.pointsplat_weigh, task)
+    # one thread, in the order of the tiles
+    return sums.new_zeros(count).index_add_(0, pairs, sums)
+
+
+def differentiate_region(
+    grid: Grid,
+    tiles: TileList,
+    table: Tensor,
+    tape: KernelTape,
+    final: Tensor,  # [tiles, 64]
+    grad_image: Tensor,  # [tiles, D, 64]
+    grad_final: Tensor,  # [tiles, 64]
+    absgrad: bool,
+) -> Tensor:
+    """Moments, colour gradients and absolute gradients of the Gaussians of a table from one region,
+    (rows of the table, MOMENTS + D [+ 2]); any numbers for those that are not in the tiles'
+    order."""
+    library = KERNELS.library
+    pairs = tiles.gaussians.numel()
+    count = tiles.order.numel()
+    columns = MOMENTS + table.shape[1] - 6 + (2 if absgrad else 0)
+    sums = grad_image.new_empty(pairs, columns)
+    out = grad_image.new_empty(len(table), columns)
+    task = task_of(table, grid, tiles.gaussians, tiles.offsets, tape.chunks, tiles.top)
+    task.fill(
+        final_=final,
+        before=tape.before,
+        blended=tape.blended,
+        grad_image=grad_image.contiguous(),
+        grad_final=grad_final.contiguous(),
+        sums=sums,
+        absolute=int(absgrad),
+    )
+    on_threads(pairs >= SEVERAL, library.pointsplat_differentiate, task)
+
+    # the sum of each Gaussian's pairs, in the order of its tiles
+    by_gaussian = torch.empty_like(tiles.places)
+    by_gaussian.index_copy_(0, tiles.places, torch.arange(pairs, **INDICES))
+    starts = torch.zeros(count + 1, **INDICES)
+    torch.cumsum(tiles.counts, 0, out=starts[1:])
+    on_threads(
+        pairs >= SEVERAL,
+        library.pointsplat_gather,
+        sums,
+        by_gaussian,
+        starts,
+        tiles.order,
+        count,
+        columns,
+        out,
+    )
+    return out
