@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from lab.rooms import light
-from pointsplat_ns.pipeline import repair
-from pointsplat_ns.pipeline import view_provider as view_source
+from pointsplat_ns.pipeline import repair_budget, view_provider
 from pointsplat_ns.view_sampling.settings import changed
 from quick_looking import QUICK, USUAL
 
@@ -32,7 +31,7 @@ def usual_looking() -> Iterator[None]:
 def small_views_by_default() -> Iterator[None]:
     """Where no views are given, those that renders are compared in have 64 x 48 pixels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view_source, "RESOLUTION", (64, 48))
+        patch.setattr(view_provider, "RESOLUTION", (64, 48))
         yield
 
 
@@ -41,7 +40,7 @@ def no_repair_by_default() -> Iterator[None]:
     """``compact`` optimises for seconds unless told otherwise; here only those tests wait for it
     that are about it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(repair.STEPS, "quick", 0)
+        patch.setitem(repair_budget.STEPS, "quick", 0)
         yield
 
 

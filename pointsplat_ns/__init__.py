@@ -25,7 +25,15 @@ TYPE_CHECKING = (
 if TYPE_CHECKING:
     from typing import Any
 
-    from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
+    from pointsplat_ns.api import (
+        Compacted,
+        clean,
+        compact,
+        example_room,
+        lod,
+        plot_views,
+        prune,
+    )
     from pointsplat_ns.errors import (
         BudgetError,
         DataError,
@@ -36,8 +44,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.metrics.lpips import lpips
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-    from pointsplat_ns.pipeline.report import Compacted
-    from pointsplat_ns.pipeline.requests import clean
     from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner, load_refiner, refine
     from pointsplat_ns.rendering import rasterization, render
     from pointsplat_ns.scene.gaussians import Gaussians
@@ -47,6 +53,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.tools.filming import open_viewer, render_path
     from pointsplat_ns.tools.folders import SceneResult, compact_folder
     from pointsplat_ns.tools.levels.levels import Levels
+    from pointsplat_ns.tools.loading import load
     from pointsplat_ns.tools.pages.scene_page import write_page
     from pointsplat_ns.tools.placing import place
     from pointsplat_ns.tools.scene_info import SceneInfo, info
@@ -55,11 +62,18 @@ if TYPE_CHECKING:
     from pointsplat_ns.view_sampling.sampler import sample_views
 
 _PUBLIC = {
-    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune"),
-    "pointsplat_ns.pipeline.requests": ("clean",),
-    "pointsplat_ns.pipeline.report": ("Compacted",),
+    "pointsplat_ns.api": (
+        "Compacted",
+        "clean",
+        "compact",
+        "example_room",
+        "lod",
+        "plot_views",
+        "prune",
+    ),
     "pointsplat_ns.tools.levels.levels": ("Levels",),
     "pointsplat_ns.tools.comparison_plots": ("plot_comparison",),
+    "pointsplat_ns.tools.loading": ("load",),
     "pointsplat_ns.tools.placing": ("place",),
     "pointsplat_ns.tools.scene_info": ("SceneInfo", "info"),
     "pointsplat_ns.pipeline.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),

@@ -10,7 +10,7 @@ import torch
 import pointsplat_ns as ps
 from making import box_room, dense_config, same, small_refiner
 from pointsplat_ns.pipeline import trained_refiner
-from pointsplat_ns.pipeline.repair import STEPS
+from pointsplat_ns.pipeline.repair_budget import STEPS
 from pointsplat_ns.pruning.merging import MERGING, Merger, merge, merge_levels, rounds
 from pointsplat_ns.pruning.merging.rounds import one_round
 from pointsplat_ns.pruning.methods import METHODS

@@ -36,7 +36,7 @@ from lab.common.ways import count_of
 from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.pipeline.options import PHOTO_STEPS
+from pointsplat_ns.pipeline.repair_budget import PHOTO_STEPS
 from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.scene.runs import METHOD_NAMES

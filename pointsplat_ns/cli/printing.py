@@ -64,10 +64,14 @@ def print_result(
     scene: Gaussians | PlyRows,
     seconds: float,
     where: Path,
-    quality: Quality | str | None,
+    quality: Quality | None,
+    in_parts: bool = False,
 ) -> None:
     """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of
-    the file and time, and how close the file is to the dense scene, or why that is not known."""
+    the file and time, and how close the file is to the dense scene, or why that is not known; a
+    scene that was merged ``in_parts`` does not fit into memory."""
+    from pointsplat_ns.tools.wording import quality_text
+
     *first, last = [{"merge": "merged", "clean": "cleaned"}.get(by, f"pruned by {by}"), *also]
     done = f"{', '.join(first)} and {last}" if first else last
     what = f"{done} to {len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
@@ -77,7 +81,12 @@ def print_result(
         )
         what = f"{nothing}, all {before:,} Gaussians fit as they are"
     print(f"{where}: {what}, {written_size(where)}, in {seconds_text(seconds)}")
-    print(quality or "not compared with the dense scene: nothing of it is visible")
+    if quality is not None:
+        print(quality_text(quality))
+    elif in_parts:
+        print("not compared with the dense scene: it does not fit into memory")
+    else:
+        print("not compared with the dense scene: nothing of it is visible")
 
 
 def print_if_larger(scene: Path, where: Path) -> None:
@@ -98,9 +107,9 @@ def print_if_larger(scene: Path, where: Path) -> None:
 def psnr_text(psnr: float | None) -> str:
     """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was
     compared."""
-    from pointsplat_ns.pipeline.quality import MOST_SAID
+    from pointsplat_ns.tools.wording import BEST_PSNR
 
-    return "-" if psnr is None else "same" if psnr == math.inf else f"{min(psnr, MOST_SAID):.1f}"
+    return "-" if psnr is None else "same" if psnr == math.inf else f"{min(psnr, BEST_PSNR):.1f}"
 
 
 def written_size(where: Path) -> str:

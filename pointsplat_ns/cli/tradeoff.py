@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
+from pointsplat_ns.pipeline.options import ViewOptions
 from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.terminal import print_table
 
@@ -17,16 +18,13 @@ if TYPE_CHECKING:
 
 def tradeoff(
     scene: options.Scene,
+    looking: options.Flat[ViewOptions],
     output: options.Output = None,
     keep: tuple[str, ...] = ("70%", "50%", "30%", "20%", "10%", "5%"),
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
     repairs: tuple[Literal["none", "quick", "thorough", "photos"], ...] = ("none", "quick"),
     views: int = 12,
-    poses: options.Poses = None,
-    resolution: options.Resolution = None,
-    up: options.Up = None,
-    data: options.Data = None,
     photos: Path | None = None,
     force: options.Force = False,
     json_output: options.Json = False,
@@ -48,11 +46,11 @@ def tradeoff(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.pipeline.quality import quality_line
     from pointsplat_ns.tools.tradeoff.points import RESULTS
     from pointsplat_ns.tools.tradeoff.recommend import next_best
+    from pointsplat_ns.tools.wording import quality_line
 
-    options.check_poses(poses)
+    options.check_poses(looking.poses)
     folder = output or options.output_beside(scene, "tradeoff", "")
     found = ps.measure_tradeoff(
         scene,
@@ -62,10 +60,10 @@ def tradeoff(
         by=by,
         repairs=repairs,
         views=views,
-        poses=poses,
-        resolution=resolution,
-        up=up,
-        data=data,
+        poses=looking.poses,
+        resolution=looking.resolution,
+        up=looking.up,
+        data=looking.data,
         photos=photos,
         force=force,
         progress=True,

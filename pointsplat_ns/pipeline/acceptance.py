@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.reasons import Cause, Reason
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.rendering.comparison.closeness import Closeness, DenseReference
 from pointsplat_ns.rendering.comparison.sizes import NEARER, RendersOfSizes, sides_of
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -31,7 +32,7 @@ class AcceptanceSettings:
 
 ACCEPTANCE = AcceptanceSettings()
 
-SMALL_GAIN = f"it brings less than {ACCEPTANCE.min_gain:g} dB"
+SMALL_GAIN = Reason(Cause.SMALL_GAIN, decibels=ACCEPTANCE.min_gain)
 """Why a change with a smaller gain is left out."""
 
 
@@ -48,7 +49,7 @@ class Comparison:
         DataError: if there are no views.
     """
 
-    def __init__(self, dense: Gaussians, views: ViewSource):
+    def __init__(self, dense: Gaussians, views: ViewProvider):
         self.reference = DenseReference(dense, views.compared())
         self.device = dense.device
         whole = views.whole()
@@ -58,8 +59,8 @@ class Comparison:
 
     def judged(
         self, before: Closeness, old: Gaussians, new: Gaussians, progress: Progress = silent
-    ) -> tuple[Closeness, str]:
-        """Errors of a changed scene, and why it is left out; empty if it is kept.
+    ) -> tuple[Closeness, Reason | None]:
+        """Errors of a changed scene, and why it is left out; None if it is accepted.
 
         Args:
             before: errors of ``old``.
@@ -70,29 +71,29 @@ class Comparison:
         end = new.to(self.device)
         after = self.reference.closeness(end, lambda share: progress("comparing renders", share))
         reason = _why_no_gain(before, after)
-        if not reason and self._others is not None:
+        if reason is None and self._others is not None:
             lost = max(ACCEPTANCE.most_loss, ACCEPTANCE.lost_share * (after.psnr - before.psnr))
             least = (psnr - lost for psnr in self._others.psnrs(old.to(self.device)))
             if not all(
                 psnr >= bound for bound, psnr in zip(least, self._others.psnrs(end), strict=True)
             ):  # NaN too
-                reason = "it harms pictures of another size"
+                reason = Reason(Cause.WORSE_IN_OTHER_SIZES)
         return after, reason
 
 
-def _why_no_gain(before: Closeness, after: Closeness) -> str:
-    """Why errors are no improvement; empty if PSNR rises by :attr:`AcceptanceSettings.min_gain` or
+def _why_no_gain(before: Closeness, after: Closeness) -> Reason | None:
+    """Why errors are no improvement; None if PSNR rises by :attr:`AcceptanceSettings.min_gain` or
     more, and the error falls in at least half of the views. The second condition refuses a gain of
     few views at the cost of the others."""
     if after.errors == before.errors:
-        return "it changes nothing"
+        return Reason(Cause.NO_CHANGE)
     if after.psnr <= before.psnr:
-        return "it does not help"
+        return Reason(Cause.NO_GAIN)
     if not after.psnr >= before.psnr + ACCEPTANCE.min_gain:  # NaN too
         return SMALL_GAIN
-    return (
-        "it is farther in most views" if 2 * closer_in(before, after) < len(before.errors) else ""
-    )
+    if 2 * closer_in(before, after) < len(before.errors):
+        return Reason(Cause.WORSE_IN_MOST_VIEWS)
+    return None
 
 
 def closer_in(before: Closeness, after: Closeness) -> int:

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import torch
 from torch import Tensor
@@ -24,15 +25,14 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.rendering import pixel_sums, pixels_of, render, render_depth
-from pointsplat_ns.rendering.comparison.closeness import DenseReference, views_text
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.rendering.comparison.each_view import each_view
 from pointsplat_ns.rendering.constants import ALPHA_MIN
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.view_sampling.content import content_size, in_units
 from pointsplat_ns.view_sampling.sampler import Sampler
@@ -70,15 +70,45 @@ class Junk:
         return torch.cat([self.undrawable, self.unseen, self.floating])
 
 
+class Rule(Enum):
+    """Why a Gaussian is removed."""
+
+    UNDRAWABLE = "undrawable"
+    UNSEEN = "unseen"
+    FLOATING = "floating"
+
+
+@dataclass(frozen=True)
+class RuleEffect:
+    """What one rule removes, together with the rules before it."""
+
+    rule: Rule
+    removed: int
+    """Number of Gaussians that this rule removes."""
+    places: int = 0
+    """Number of places of cameras, for unseen Gaussians; 0 if there was no place to look from."""
+    clusters: int = 0
+    """Number of clusters of floating Gaussians."""
+    seen_in: int = 0
+    """Number of views that tell what floats."""
+    psnr: float | None = None
+    """PSNR of renders without what was removed so far, dB; inf if nothing differs, None if nothing
+    was compared."""
+    worst: float | None = None
+    """The same of the worst view, dB."""
+    views: int = 0
+    """Number of the compared views."""
+
+
 @dataclass(frozen=True, eq=False)
 class Cleaning:
-    """The junk of a scene, with notes on how renders change without it."""
+    """The junk of a scene, and how renders change without it."""
 
     junk: Junk
     count: int
     """Number of Gaussians in the scene as read."""
-    notes: tuple[str, ...]
-    """A line of text for each rule."""
+    effects: tuple[RuleEffect, ...]
+    """What each rule removes; empty if nothing is removed."""
 
     def apply(self, scene: Gaussians, at_least: int) -> Gaussians:
         """The scene as read, perhaps with fewer SH bands, without its junk. The most opaque junk
@@ -190,7 +220,7 @@ def clusters(scene: Gaussians) -> Tensor:
 def clean_scene(
     dense: Gaussians,
     at_least: int,
-    views: ViewSource,
+    views: ViewProvider,
     progress: Progress = silent,
     strength: float | None = None,
 ) -> Cleaning:
@@ -204,50 +234,35 @@ def clean_scene(
     junk = find_junk(dense, progress, floating, strength or 0.0)
     dropped = junk.first(len(dense) - at_least)
     if len(dropped.indices) == 0:
-        why = (
-            f"; {len(junk.indices):,} could go, but the budget keeps all"
-            if len(junk.indices)
-            else ""
-        )
-        return Cleaning(junk, len(dense), (f"clean: nothing removed{why}",))
+        return Cleaning(junk, len(dense), ())
     progress("comparing renders without junk", 0.0)
     try:
         reference = DenseReference(dense, views.scored(4))
     except DataError:  # no views
         reference = None
-    places = (
-        f"looking around from {junk.places} places"
-        if junk.places
-        else "nothing to look from was found"
-    )
-    hidden = torch.cat([dropped.undrawable, dropped.unseen])
-    rules = [
-        (dropped.undrawable, dropped.undrawable, "that cannot be drawn"),
-        (dropped.unseen, hidden, f"that are seen from nowhere ({places})"),
-    ]
+
+    def compared(effect: RuleEffect, so_far: Tensor) -> RuleEffect:
+        if reference is None or effect.removed == 0:
+            return effect
+        psnr, worst = reference.psnr(_without(dense, so_far))
+        return replace(effect, psnr=psnr, worst=worst, views=len(reference.views))
+
+    effects = []
+    if len(dropped.undrawable):
+        effect = RuleEffect(Rule.UNDRAWABLE, len(dropped.undrawable))
+        effects.append(compared(effect, dropped.undrawable))
+    effect = RuleEffect(Rule.UNSEEN, len(dropped.unseen), places=junk.places)
+    effects.append(compared(effect, torch.cat([dropped.undrawable, dropped.unseen])))
     if floating is not None and strength is not None:
-        found = counted(len(clusters(dense[dropped.floating.to(dense.device)]).unique()), "cluster")
-        rules.append(
-            (
-                dropped.floating,
-                dropped.indices,
-                f"that float before what {len(floating)} views show, {found}",
-            )
+        labels = clusters(dense[dropped.floating.to(dense.device)])
+        effect = RuleEffect(
+            Rule.FLOATING,
+            len(dropped.floating),
+            clusters=len(labels.unique()),
+            seen_in=len(floating),
         )
-    notes = []
-    for gone, so_far, what in rules if len(dropped.undrawable) else rules[1:]:
-        close = ""
-        if reference is not None and len(gone):
-            psnr, worst = reference.psnr(_without(dense, so_far))
-            seen = views_text(len(reference.views))
-            close = (
-                f"; renders reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the "
-                f"worst of {seen}"
-            )
-            if math.isinf(psnr):
-                close = f"; renders of {seen} stay the same"
-        notes.append(f"clean: {len(gone):,} of {len(dense):,} removed {what}{close}")
-    return Cleaning(junk, len(dense), tuple(notes))
+        effects.append(compared(effect, dropped.indices))
+    return Cleaning(junk, len(dense), tuple(effects))
 
 
 def _without(scene: Gaussians, indices: Tensor) -> Gaussians:

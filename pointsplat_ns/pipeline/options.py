@@ -1,242 +1,309 @@
-"""Requests: all options of pruning or of compacting in one object, checked before a scene is
-read."""
+"""Options of a request, for the command line and the Python API alike.
+
+``tyro`` turns each field into an option of a command; the docstring below a field is its help.
+Options hold what the user wrote. Derived values are parsed once: :meth:`ReductionOptions.check`,
+called before a scene is read, raises what is wrong with them. This module imports torch only then.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
+from tyro.conf import Suppress, arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
-from pointsplat_ns.pruning import (
-    Keep,
-    Method,
-    PruneSettings,
-    found_by_trying,
-    method_named,
-    parse_keep,
-    resolve_keep,
-)
-from pointsplat_ns.scene.gaussians import PLAIN, Gaussians, Traits
+from pointsplat_ns.pipeline.repair_budget import Effort, PhotoBudget, RepairBudget
 
 if TYPE_CHECKING:
+    import torch
+
     from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner
+    from pointsplat_ns.pruning import Keep, Method
+    from pointsplat_ns.scene.gaussians import Gaussians, Traits
+    from pointsplat_ns.view_sampling.upright import Up
 
-Effort = Literal["instant", "quick", "thorough"]
+NO_POSES = "none"
+"""In place of a file of cameras: views are sampled, whatever lies beside the scene."""
 
-STEPS: dict[Effort, int] = {"instant": 0, "quick": 192, "thorough": 1200}
-"""Number of repair steps of each effort, for at most :data:`FEW` Gaussians."""
+KEPT_AUTO = 0.3
+"""Largest loss of PSNR in held-out photos of ``--photos --keep auto``, dB."""
 
-FEW = 20_000
-"""Number of Gaussians above which a repair takes more steps, in more views."""
-
-
-PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 2400, "thorough": 12000}
-"""Number of steps on photos of each effort."""
+Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
 
 def default_device() -> torch.device:
     """CUDA if available, else the CPU."""
+    import torch
+
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-@dataclass(frozen=True)
-class RepairBudget:
-    """Length of a repair, in steps or seconds. Raises PointSplatError if it is not a positive time
-    or one of :data:`STEPS`."""
+def _as_written(metavar: str) -> PrimitiveConstructorSpec:
+    """How tyro reads an option that the package parses itself: as the text that was written."""
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: True,
+        str_from_instance=lambda value: [str(value)],
+    )
 
-    effort: Effort = "quick"
-    """Number of steps, see :data:`STEPS`. The result does not depend on the speed of the
-    machine."""
-    seconds: float | None = None
-    """Wall-clock time, in place of ``effort``. The result depends on the speed of the machine."""
-    growth: float = 1.0
-    """Factor on the number of steps, and of sampled views."""
-    rate: float = 1.0
-    """Factor on the learning rates."""
 
-    def __post_init__(self) -> None:
-        if self.effort not in STEPS:
-            raise PointSplatError(f"effort is {self.effort!r}; expected one of {', '.join(STEPS)}")
-        if self.seconds is not None and not 0 <= self.seconds < math.inf:
-            raise PointSplatError(f"the time to repair is {self.seconds:g} s; expected 0 or more")
+def _photos(words: list[str]) -> Path | bool:
+    if len(words) > 1 or words == [""]:
+        raise ValueError("expected a folder of photos, or nothing for those of a run")
+    return Path(words[0]) if words else True
 
-    @property
-    def steps(self) -> int:
-        """Number of steps of the effort."""
-        return round(self.growth * STEPS[self.effort])
 
-    def for_count(self, count: int) -> RepairBudget:
-        """The budget for a scene of ``count`` Gaussians. Steps grow with the root of the count, to
-        four times as many: a view shows more Gaussians of a large scene, and a smaller share of
-        them. Of still more Gaussians, each is seen in fewer steps, and moves as far in each,
-        whatever the pixel: so the learning rates fall.
+Budget = Annotated[Any, _as_written("BUDGET")]
+"""A ratio, count, size or PSNR, as text or parsed (:data:`~pointsplat_ns.pruning.Keep`)."""
 
-        Example:
-            >>> budgets = [RepairBudget().for_count(count) for count in (5_000, 80_000, 320_000, 3_200_000)]
-            >>> [(budget.growth, budget.rate) for budget in budgets]
-            [(1.0, 1.0), (2.0, 1.0), (4.0, 1.0), (4.0, 0.1)]
-        """
-        most = 4.0
-        growth = min(max(math.sqrt(count / FEW), 1.0), most)
-        return replace(self, growth=growth, rate=min(1.0, most**2 * FEW / count))
+Poses = Annotated[Path | str | None, _as_written("PATH")]
+"""A file of cameras, a run, or :data:`NO_POSES`."""
 
-    @property
-    def empty(self) -> bool:
-        """Whether the budget has no step."""
-        return self.seconds == 0 if self.seconds is not None else self.steps == 0
+Resolution = Annotated[tuple[int, int] | str | None, _as_written("WxH")]
 
-    def share_done(self, steps: int, seconds: float) -> float:
-        """Used share of the budget after ``steps`` steps and ``seconds`` seconds; 1 or more at the
-        end. The budget must not be empty."""
-        return seconds / self.seconds if self.seconds is not None else steps / self.steps
+Photos = Annotated[
+    Path | str | bool,
+    PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[FOLDER]",
+        instance_from_str=_photos,
+        is_instance=lambda value: isinstance(value, (bool, Path, str)),
+        str_from_instance=lambda value: ["none"] if value is False else [str(value)],
+    ),
+]
+"""Whether to use the photos of a run, or the folder of other photos."""
 
 
 @dataclass(frozen=True)
-class PhotoBudget(RepairBudget):
-    """Length of the optimisation against photos."""
+class ViewOptions:
+    """Where renders look from, and how large they are."""
+
+    poses: Poses = None
+    """A file of cameras of the scene: cameras.json of 3DGS, transforms.json of nerfstudio, or the
+    folder of a COLMAP project. By default the views of its dataset, or of such a file beside the
+    scene or above it, or sampled ones; none always samples them."""
+    resolution: Resolution = None
+    """Size of the pictures that people look at, pixels. Decisions by rendering are made at this
+    size. By default the size of the photos, if there are any, else 1920x1080."""
+    up: Annotated[str | None, arg(metavar="AXIS")] = None
+    """The axis that is up in the scene: x, y, z, -x, -y or -z, for sampled views; by default the
+    file's own, or an estimate. Write --up=-y for a negative axis."""
+    data: Path | str | None = None
+    """Folder of the run's photos and poses, or one above it, if it is no longer where the run says.
+    In a folder of scenes, a run whose data is not found gets sampled views, which its note says."""
+
+    @cached_property
+    def size(self) -> tuple[int, int] | None:
+        """``resolution``, parsed. Raises PointSplatError if it is not a size."""
+        if self.resolution is None:
+            return None
+        from pointsplat_ns.rendering.comparison.sizes import parse_resolution
+
+        return parse_resolution(self.resolution)
+
+    @cached_property
+    def upward(self) -> Up | None:
+        """``up``, parsed. Raises PointSplatError if it is not an axis."""
+        if self.up is None:
+            return None
+        from pointsplat_ns.view_sampling.upright import up_named
+
+        return up_named(self.up)
 
     @property
-    def steps(self) -> int:
-        """Number of steps of the effort."""
-        return PHOTO_STEPS[self.effort]
+    def sampled(self) -> bool:
+        """Whether views are sampled, whatever lies beside the scene."""
+        return self.poses is not None and str(self.poses) == NO_POSES
+
+    def check(self) -> None:
+        """Raise a PointSplatError if an option is not valid."""
+        _ = self.size, self.upward
 
 
 @dataclass(frozen=True)
-class PruneRequest:
-    """Options of pruning.
-
-    Raises:
-        BudgetError: if ``keep`` is not a budget.
-        PointSplatError: if the method is unknown, or an option does not fit it.
+class ReductionOptions:
+    """How many Gaussians are kept, and which.
 
     Example:
-        >>> PruneRequest("30%", sh="1").count_of(1000, sh_degree=1)
+        >>> ReductionOptions("30%", sh="1").count_of(1000, sh_degree=1)
         300
     """
 
-    keep: Keep | str
-    """Ratio, count, size of the file, or PSNR of renders against those of the dense scene."""
+    keep: Budget = "0.3"
+    """Size of the result: a ratio (0.3), a percentage (30%), a count (50000 or 50k), the size of
+    the file (12MB or 800kB; for .spz and .sog the count is searched for, which takes two or three
+    times as long), or auto:35, the smallest scene whose renders reach 35 dB PSNR against those of
+    the dense scene (auto alone means 35)."""
     by: str = "merge"
-    """One of :data:`~pointsplat_ns.pruning.METHODS`."""
-    sh: str = "all"
-    """"all" keeps the SH bands, a digit cuts them to that degree, "auto" cuts them to the lowest
-    degree whose renders reach 40 dB against those with all bands."""
+    """The method. merge replaces neighbours by one Gaussian each and is usually best; every other
+    method keeps Gaussians as they are: coverage (empties no region), paper (eq. 3), authors (the
+    formula of its released code), opacity, random; lightgaussian and pup score by views of the
+    scene."""
     opacity_weight: float | None = None
-    """Lambda of the methods that weigh opacity; None is the paper's value."""
+    """Lambda of paper and authors: the weight of opacity; by default the paper's 0.3."""
+    sh: Bands = "all"
+    """SH bands to keep: all, up to a degree, or auto, the lowest degree whose renders reach 40
+    dB."""
     clean: bool = False
-    """Whether to remove Gaussians that no picture needs first
-    (:mod:`~pointsplat_ns.pipeline.cleaning`). ``keep`` still refers to the dense scene, and the
-    result has exactly that number of Gaussians."""
-    suffix: str = ".ply"
-    """Suffix of the format of the result. A size or a PSNR in the text ``keep`` is for it, if it
-    names none."""
-    budget: Keep = field(init=False)
-    """``keep``, parsed if it is text."""
-    method: Method = field(init=False)
-    """The method called ``by``."""
+    """First remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read."""
+    target_format: Suppress[str] = ".ply"
+    """Suffix of the format of the result, which a size or a PSNR in ``keep`` is for if it names
+    none."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "method", method_named(self.by, self.opacity_weight))
+    @cached_property
+    def budget(self) -> Keep:
+        """``keep``, parsed. Raises BudgetError if it is not a budget."""
+        from pointsplat_ns.pruning import parse_keep
+
+        return (
+            parse_keep(self.keep, self.target_format) if isinstance(self.keep, str) else self.keep
+        )
+
+    @cached_property
+    def method(self) -> Method:
+        """The method ``by``. Raises PointSplatError if it is unknown, or has no opacity weight."""
+        from pointsplat_ns.pruning import method_named
+
+        return method_named(self.by, self.opacity_weight)
+
+    def check(self) -> None:
+        """Raise a PointSplatError if an option is not valid, or does not fit another."""
+        _ = self.method, self.budget
         if self.sh not in ("all", "auto", "0", "1", "2", "3"):
             raise PointSplatError(f"sh is {self.sh!r}; expected all, auto or a degree from 0 to 3")
-        budget = parse_keep(self.keep, self.suffix) if isinstance(self.keep, str) else self.keep
-        object.__setattr__(self, "budget", budget)
 
-    def count_of(self, n: int, sh_degree: int, traits: Traits = PLAIN) -> int | None:
+    def count_of(self, n: int, sh_degree: int, traits: Traits | None = None) -> int | None:
         """Number of Gaussians to keep of ``n``, which depends on the SH degree and traits of the
         result where it has to fit a file; None if it needs a search (a PSNR, or the size of a
         compressed file). Raises BudgetError if the budget does not fit the scene."""
-        return (
-            None
-            if found_by_trying(self.budget)
-            else resolve_keep(n, self.budget, sh_degree, traits)
-        )
+        from pointsplat_ns.pruning import found_by_trying, resolve_keep
+        from pointsplat_ns.scene.gaussians import PLAIN
+
+        if found_by_trying(self.budget):
+            return None
+        return resolve_keep(n, self.budget, sh_degree, PLAIN if traits is None else traits)
 
 
-@dataclass(frozen=True, eq=False)
-class CompactRequest:
-    """Options of compacting: prune a scene, refine it if there is a refiner, and repair it."""
+@dataclass(frozen=True)
+class PruneOptions(ViewOptions, ReductionOptions):
+    """Options of :func:`pointsplat_ns.prune`."""
 
-    prune: PruneRequest
-    refiner: TrainedRefiner | None = None
-    """None for no refinement."""
-    repair: RepairBudget = RepairBudget("instant")
-    """Length of the repair."""
-    photos: PhotoBudget | None = None
-    """Length of the optimisation against photos; None for none."""
+    photos: Photos = False
+    """Also print PSNR in held-out photos: of the dataset of a run, or every eighth photo, by name,
+    in FOLDER. Nothing is trained. Its poses, those of --poses or of a file of cameras there, above
+    it or beside the scene, are then the views."""
+
+    def check(self) -> None:
+        ViewOptions.check(self)
+        ReductionOptions.check(self)
+
+
+@dataclass(frozen=True)
+class CompactOptions(PruneOptions):
+    """Options of :func:`pointsplat_ns.compact`: a scene is pruned, refined if there is a refiner,
+    and repaired.
+
+    ``keep`` may be None, and ``by`` empty, until :meth:`completed`.
+    """
+
+    keep: Budget = None
+    """Size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before
+    repairs. With --photos, auto is the smallest file that loses at most 0.3 dB in held-out photos.
+    By default the budget of the refiner's training; without a refiner 0.1."""
+    by: str = ""
+    """The method of prune; by default the method of the refiner's training; without a refiner
+    merge."""
+    refiner: Path | str | None = None
+    """A trained network that refines the scene before the steps: a pointsplat run (its folder or
+    config.yml), a .safetensors file, or shipped; by default none."""
+    effort: Effort = "quick"
+    """Length of the repair: no steps (instant), 192 (quick), or 1200 (thorough); up to four times
+    as many for more than 20,000 Gaussians."""
+    seconds: float | None = None
+    """Duration of the repair, in place of --effort; by default none is set. Ctrl-C ends it earlier
+    and writes the scene so far."""
+    photos: Photos = False
+    """In place of the repair train on photos, by 2400 steps (quick) or 12000 (thorough), or for
+    --seconds. Photos in and outside of the steps say whether it helped. For a run, those of its
+    dataset; for any scene, those in FOLDER, with the poses of --poses, or of a file of cameras
+    there, above it or beside the scene."""
     target_db: float | None = None
-    """Least PSNR of the file against the dense scene's renders, dB, in place of the budget; None
-    for none."""
-    most_lost: float | None = None
-    """Largest loss of PSNR of the file in held-out photos, dB, in place of the budget; None for
-    none."""
-    unfinished: Path | None = None
-    """The file of :func:`~pointsplat_ns.pipeline.repair.repair`'s state; None for none."""
-
-    @classmethod
-    def of(
-        cls,
-        refiner: TrainedRefiner | None = None,
-        keep: Keep | str | None = None,
-        by: str | None = None,
-        sh: str = "all",
-        clean: bool = False,
-        repair: RepairBudget = RepairBudget("instant"),
-        photos: bool = False,
-        suffix: str = ".ply",
-        target_db: float | None = None,
-    ) -> CompactRequest:
-        """A request from options that may be missing: ``keep`` and ``by`` are then those of the
-        refiner's training; without a refiner, a tenth and merging. With ``photos``, a number of
-        seconds is for the steps on photos, the repair is quick, and ``keep="auto"`` is the smallest
-        file that loses at most 0.3 dB in held-out photos. Errors are those of
-        :class:`PruneRequest`, or a BudgetError if the target is not a positive number, or given
-        with a budget or photos."""
-        if target_db is not None and not 0 < target_db < math.inf:
-            raise BudgetError(
-                f"--target-db is {target_db:g}; expected a positive number, such as 32"
-            )
-        if target_db is not None and (photos or keep is not None):
-            other = "photos, which may differ from renders" if photos else "a budget"
-            raise BudgetError(
-                "--target-db finds a size by renders of the dense scene; expected it without "
-                f"{other}"
-            )
-        usual = PruneSettings(0.1, "merge") if refiner is None else refiner.settings
-        by = usual.by if by is None else by
-        most_lost = 0.3 if photos and keep == "auto" else None
-        keep = None if most_lost else keep
-        weight = usual.opacity_weight if method_named(by).weighs_opacity else None
-        prune = PruneRequest(usual.keep if keep is None else keep, by, sh, weight, clean, suffix)
-        if not photos:
-            return cls(prune, refiner, repair, target_db=target_db)
-        trained = PhotoBudget(repair.effort, repair.seconds)
-        repair = repair if repair.seconds is None else RepairBudget()
-        return cls(prune, refiner, repair, trained, most_lost=most_lost)
+    """In place of --keep, the smallest file that has at least this PSNR against renders of the
+    dense scene, after all repairs; by default none is searched for."""
+    most_lost: Suppress[float | None] = None
+    """Largest loss of PSNR of the file in held-out photos, dB, in place of the budget; set by
+    :meth:`completed`."""
 
     @property
-    def device(self) -> torch.device:
-        """The device that renders: the refiner's, or the default one."""
-        return default_device() if self.refiner is None else self.refiner.device
+    def on_photos(self) -> bool:
+        """Whether the scene is trained on photos."""
+        return self.photos is not False
+
+    @cached_property
+    def repair(self) -> RepairBudget:
+        """Length of the repair. ``seconds`` are for the training on photos, where there is one."""
+        if self.on_photos and self.seconds is not None:
+            return RepairBudget()
+        return RepairBudget(self.effort, self.seconds)
+
+    @cached_property
+    def photo_budget(self) -> PhotoBudget | None:
+        """Length of the training on photos; None without one."""
+        return PhotoBudget(self.effort, self.seconds) if self.on_photos else None
 
     @property
     def searched(self) -> bool:
         """Whether the count is searched for that reaches a quality after all stages."""
         return self.target_db is not None or self.most_lost is not None
 
-    def check_sh_degree(self, dense: Gaussians) -> None:
+    def check(self) -> None:
+        if self.target_db is not None and not 0 < self.target_db < math.inf:
+            raise BudgetError(
+                f"--target-db is {self.target_db:g}; expected a positive number, such as 32"
+            )
+        if self.target_db is not None and (self.on_photos or self.keep is not None):
+            other = "photos, which may differ from renders" if self.on_photos else "a budget"
+            raise BudgetError(
+                "--target-db finds a size by renders of the dense scene; expected it without "
+                f"{other}"
+            )
+        _ = self.repair, self.photo_budget
+        ViewOptions.check(self)
+
+    def completed(self, refiner: TrainedRefiner | None = None) -> CompactOptions:
+        """The options, checked, with ``keep`` and ``by`` of the refiner's training where none is
+        named; without a refiner, a tenth and merging. Raises a PointSplatError as :meth:`check` and
+        :meth:`ReductionOptions.check`."""
+        from pointsplat_ns.pruning import PruneSettings, method_named
+
+        self.check()
+        usual = PruneSettings(0.1, "merge") if refiner is None else refiner.settings
+        by = self.by or usual.by
+        weight = self.opacity_weight
+        if weight is None and method_named(by).weighs_opacity:
+            weight = usual.opacity_weight
+        most_lost = KEPT_AUTO if self.on_photos and self.keep == "auto" else self.most_lost
+        keep = usual.keep if self.keep is None or most_lost is not None else self.keep
+        done = replace(self, keep=keep, by=by, opacity_weight=weight, most_lost=most_lost)
+        ReductionOptions.check(done)
+        return done
+
+    def check_sh_degree(self, dense: Gaussians, refiner: TrainedRefiner | None) -> None:
         """Raise a SceneError, before the long computations, if the SH degree after pruning is
         certain to exceed the refiner's."""
-        if self.refiner is None:
+        if refiner is None:
             return
-        sh = self.prune.sh
-        limit = self.refiner.network.config.sh_degree
-        if dense.sh_degree > limit and (sh == "all" or (sh.isdigit() and int(sh) > limit)):
+        limit = refiner.network.config.sh_degree
+        certain = self.sh == "all" or (self.sh.isdigit() and int(self.sh) > limit)
+        if dense.sh_degree > limit and certain:
             raise SceneError(
-                f"the scene has SH degree {dense.sh_degree}; the refiner {self.refiner.source} was "
+                f"the scene has SH degree {dense.sh_degree}; the refiner {refiner.source} was "
                 f"built for at most {limit}; cut it with --sh {limit}"
             )

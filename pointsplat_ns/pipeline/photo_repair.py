@@ -31,7 +31,6 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.pipeline.acceptance import ACCEPTANCE, SMALL_GAIN
 from pointsplat_ns.pipeline.optimiser import RATES, Adam, AdamSettings, optimised, size_factors
-from pointsplat_ns.pipeline.options import PhotoBudget
 from pointsplat_ns.pipeline.photos.examples import (
     Example,
     Photos,
@@ -39,8 +38,10 @@ from pointsplat_ns.pipeline.photos.examples import (
     mean_psnr,
     render_of,
 )
+from pointsplat_ns.pipeline.reasons import Cause, Reason
 from pointsplat_ns.pipeline.repair import OptimisationRun, rate_factor
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pipeline.repair_budget import PhotoBudget
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views, spread_indices
@@ -115,13 +116,13 @@ class PhotoRepaired:
     interrupted: bool
     """Whether Ctrl-C ended it early."""
 
-    def why_not(self, most_lost: float = 0.0) -> str:
-        """Why the scene is not kept in place of the other, if photos of no step may lose that many
-        dB; empty if it is."""
+    def rejection(self, most_lost: float = 0.0) -> Reason | None:
+        """Why the scene does not replace the other, if photos of no step may lose that many dB;
+        None if it does."""
         if not self.after >= self.before + ACCEPTANCE.min_gain:  # NaN too
             return SMALL_GAIN
         lost = self.unseen_before - self.unseen
-        return f"other photos lose {lost:.1f} dB" if lost > most_lost else ""
+        return Reason(Cause.WORSE_IN_OTHER_PHOTOS, decibels=lost) if lost > most_lost else None
 
     def beside(self, other: Gaussians, photos: Photos) -> PhotoRepaired:
         """The same, compared with another scene in the same photos."""
@@ -152,7 +153,7 @@ def photo_repair(
     scene: Gaussians,
     dense: Gaussians,
     photos: Photos,
-    views: ViewSource,
+    views: ViewProvider,
     budget: PhotoBudget,
     progress: Callable[[float], None] | None = None,
 ) -> PhotoRepaired:
@@ -181,15 +182,24 @@ def photo_repair(
     examples = _examples(photos, used, dense, views, round(growth * PHOTO_REPAIR.side))
     last = run.take(scene, _scenes(scene, examples, views, run), progress)
     after, unseen = _psnrs(last, photos)
-    psnrs = (before, after, unseen_before, unseen)
-    counts = (len(used), len(compared), run.count)
-    return PhotoRepaired(last, *psnrs, *counts, run.seconds, run.interrupted)
+    return PhotoRepaired(
+        scene=last,
+        before=before,
+        after=after,
+        unseen_before=unseen_before,
+        unseen=unseen,
+        used=len(used),
+        compared=len(compared),
+        steps=run.count,
+        seconds=run.seconds,
+        interrupted=run.interrupted,
+    )
 
 
 def _scenes(
     scene: Gaussians,
     examples: Iterator[Callable[[], Example]],
-    views: ViewSource,
+    views: ViewProvider,
     run: OptimisationRun,
 ) -> Iterator[Gaussians]:
     """The scene after each step of a run, without end."""
@@ -211,7 +221,7 @@ def _scenes(
 
 
 def _examples(
-    photos: Photos, used: list[int], dense: Gaussians, views: ViewSource, side: int
+    photos: Photos, used: list[int], dense: Gaussians, views: ViewProvider, side: int
 ) -> Iterator[Callable[[], Example]]:
     """Photos, each once before any is repeated, and renders of the dense scene, each drawn once;
     without end. Their longer side has about ``side`` pixels."""

@@ -19,10 +19,11 @@ from pointsplat_ns.pipeline.budget_search import (
     share_done,
     smallest_within,
 )
-from pointsplat_ns.pipeline.cleaning import clean_scene
-from pointsplat_ns.pipeline.options import PruneRequest
-from pointsplat_ns.pipeline.quality import Judge, decibels, through_file
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pipeline.cleaning import Cleaning, clean_scene
+from pointsplat_ns.pipeline.options import ReductionOptions
+from pointsplat_ns.pipeline.quality import Judge, through_file
+from pointsplat_ns.pipeline.report import PsnrSearch, ShCut, SizeSearch
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import (
     Megabytes,
     WithinPsnr,
@@ -33,30 +34,32 @@ from pointsplat_ns.pruning import (
     select,
 )
 from pointsplat_ns.pruning.merging import Merger, merge
-from pointsplat_ns.rendering.comparison.closeness import DenseReference, views_text
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.formats.rounding import rounding_for
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.quantities import counted
 
 
 @dataclass(frozen=True, eq=False)
 class Pruned:
-    """A smaller scene, with notes."""
+    """A smaller scene, and how it was found."""
 
     scene: Gaussians
-    notes: tuple[str, ...]
-    """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
+    sh: ShCut | None = None
+    """The SH bands that were cut; None if all were asked for."""
+    cleaning: Cleaning | None = None
+    """What cleaning removed; None if it was not asked for."""
+    search: PsnrSearch | SizeSearch | None = None
+    """The search for the count; None if it follows from the budget."""
     limit: FileLimit | None = None
     """The limit of a compressed file, and the rounding that meets it; None for another budget."""
 
 
 def prune_scene(
     dense: Gaussians,
-    request: PruneRequest,
-    views: ViewSource | None = None,
+    options: ReductionOptions,
+    views: ViewProvider | None = None,
     progress: Progress = silent,
     rounding: bool = True,
 ) -> Pruned:
@@ -64,32 +67,32 @@ def prune_scene(
     a compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met,
     SceneError if no Gaussian of the scene can be drawn, and DataError if views are needed and there
     are none."""
+    options.check()
     need_usable(dense)
-    views = views or ViewSource(dense)
-    full, about_sh = _with_sh(dense, request.sh, views, progress)
-    count = request.count_of(len(full), full.sh_degree, full.traits)
+    views = views or ViewProvider(dense)
+    full, sh_cut = _with_sh(dense, options.sh, views, progress)
+    count = options.count_of(len(full), full.sh_degree, full.traits)
     start = full
     cleaning = None
     limit = None
-    searched = ""
-    if request.clean:
+    search: PsnrSearch | SizeSearch | None = None
+    if options.clean:
         cleaning = clean_scene(dense, count or 1, views, progress)
         start = cleaning.apply(full, count or 1)
     scored = functools.partial(views.scored, VIEW_COUNTS.scored)
-    merging = request.method.score is None
-    report = functools.partial(progress, "merging" if merging else f"scoring by {request.by}")
+    merging = options.method.score is None
+    report = functools.partial(progress, "merging" if merging else f"scoring by {options.by}")
     if count is not None and merging:
         scene = merge(start, count, report, views.for_merging()).scene
     elif count is not None:
-        scene = start[
-            select(score_of(start, request.method, scored, request.opacity_weight, report), count)
-        ]
+        scores = score_of(start, options.method, scored, options.opacity_weight, report)
+        scene = start[select(scores, count)]
     else:
         if merging:
             merger = Merger(start, views.for_merging())
         else:
             report(0.0)
-            scores = score_of(start, request.method, scored, request.opacity_weight, report)
+            scores = score_of(start, options.method, scored, options.opacity_weight, report)
 
         def make(count: int) -> Gaussians:
             if cleaning is not None and count > len(start):
@@ -97,27 +100,25 @@ def prune_scene(
             return merger.merged(count).scene if merging else start[select(scores, count)]
 
         searching = functools.partial(progress, "trying counts")
-        if isinstance(request.budget, Megabytes):
-            scene, limit, searched = _for_size(dense, start, make, request.budget, views, searching)
+        budget = options.budget
+        if isinstance(budget, Megabytes):
+            scene, limit, search = _for_size(dense, start, make, budget, views, searching)
         else:
-            assert isinstance(request.budget, WithinPsnr)
-            scene, limit, searched = _for_psnr(dense, make, request.budget, views, searching)
+            assert isinstance(budget, WithinPsnr)
+            scene, limit, search = _for_psnr(dense, make, budget, views, searching)
     if limit is not None and rounding:
         scene = limit.rounded(scene)
-    about_views = views.text if views.origin else ""
-    about_junk = () if cleaning is None else cleaning.notes
-    notes = tuple(note for note in (about_views, about_sh, *about_junk, searched) if note)
-    return Pruned(scene, notes, limit)
+    return Pruned(scene=scene, sh=sh_cut, cleaning=cleaning, search=search, limit=limit)
 
 
 def _with_sh(
-    dense: Gaussians, sh: str, views: ViewSource, progress: Progress
-) -> tuple[Gaussians, str]:
-    """The scene with the SH bands that ``sh`` keeps, and a line on them; an empty one if it keeps
-    all."""
+    dense: Gaussians, sh: str, views: ViewProvider, progress: Progress
+) -> tuple[Gaussians, ShCut | None]:
+    """The scene with the SH bands that ``sh`` keeps, and what was cut; None if all are asked
+    for."""
     if sh == "all":
-        return dense, ""
-    reached = ""
+        return dense, None
+    reached = None
     if sh == "auto":
         progress("comparing SH degrees", 0.0)
         reference = DenseReference(dense, views.compared())
@@ -128,27 +129,25 @@ def _with_sh(
         degree, psnr = next(
             (pair for pair in psnrs if pair[1] >= 40.0), (dense.sh_degree, math.inf)
         )
-        if math.isfinite(psnr):
-            reached = f", {psnr:.1f} dB PSNR against all bands"
+        reached = psnr if math.isfinite(psnr) else None
     else:
         degree = int(sh)
     if degree >= dense.sh_degree:
-        return dense, f"SH degree {dense.sh_degree} kept"
-    lost = energy_lost(dense, degree)
-    cut = f"SH degree {dense.sh_degree} cut to {degree}"
-    return cut_sh(dense, degree), f"{cut}: colours change {lost:.0%} less with the view{reached}"
+        return dense, ShCut(before=dense.sh_degree, after=dense.sh_degree)
+    cut = ShCut(before=dense.sh_degree, after=degree, lost=energy_lost(dense, degree), psnr=reached)
+    return cut_sh(dense, degree), cut
 
 
 def _for_psnr(
     dense: Gaussians,
     make: Callable[[int], Gaussians],
     budget: WithinPsnr,
-    views: ViewSource,
+    views: ViewProvider,
     progress: Callable[[float], None],
-) -> tuple[Gaussians, FileLimit | None, str]:
+) -> tuple[Gaussians, FileLimit | None, PsnrSearch]:
     """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit
-    of its file: the scene has the PSNR when it is rounded; and a line on the search. ``make(n)``
-    returns n Gaussians."""
+    of its file: the scene has the PSNR when it is rounded; and the search. ``make(n)`` returns n
+    Gaussians."""
     judge = Judge(dense, views)
     kind = format_to_write(budget.suffix)
     limit = (
@@ -166,11 +165,8 @@ def _for_psnr(
         return psnr, (scene, psnr, worst)
 
     (scene, psnr, worst), found = smallest_within(len(dense), measure, budget.value)
-    note = (
-        f"{counted(len(found.tried), 'size')} tried: {decibels(psnr)} against the dense scene, "
-        f"{decibels(worst)} in the worst of {views_text(len(judge.views))}"
-    )
-    return scene, limit, note
+    search = PsnrSearch(tried=len(found.tried), psnr=psnr, worst=worst, views=len(judge.views))
+    return scene, limit, search
 
 
 def _for_size(
@@ -178,11 +174,11 @@ def _for_size(
     start: Gaussians,
     make: Callable[[int], Gaussians],
     budget: Megabytes,
-    views: ViewSource,
+    views: ViewProvider,
     progress: Callable[[float], None],
-) -> tuple[Gaussians, FileLimit, str]:
-    """The largest scene whose compressed file has a size, before rounding, the rounding, and a line
-    on the search; ``start`` is the largest scene allowed, ``make(n)`` returns n Gaussians."""
+) -> tuple[Gaussians, FileLimit, SizeSearch]:
+    """The largest scene whose compressed file has a size, before rounding, the rounding, and the
+    search; ``start`` is the largest scene allowed, ``make(n)`` returns n Gaussians."""
     limit = FileLimit(format_to_write(budget.suffix), budget.bytes)
     try:
         reference = DenseReference(dense, views.compared())
@@ -190,8 +186,4 @@ def _for_size(
     except DataError:  # no views
         found = largest_within(start, make, limit, progress)
     scene, rounded, tries = found
-    return (
-        scene,
-        rounded,
-        f"{counted(tries, 'size')} tried for {bytes_text(limit.most)} as {limit.kind.name}",
-    )
+    return scene, rounded, SizeSearch(tried=tries, bytes=limit.most, format=limit.kind.name)

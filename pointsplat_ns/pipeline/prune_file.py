@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.pipeline.options import PruneRequest
-from pointsplat_ns.pipeline.photos.posed_scene import PosesFile, without_poses
+from pointsplat_ns.pipeline.options import PruneOptions
+from pointsplat_ns.pipeline.photos.posed_scene import PosesFile
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.pruning.merging.by_cells import merge_file
@@ -26,7 +26,6 @@ from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.workers import check_jobs
 from pointsplat_ns.view_sampling.sampler import Sampler
-from pointsplat_ns.view_sampling.upright import Up
 
 
 @dataclass(frozen=True)
@@ -48,14 +47,14 @@ MEMORY = MemorySettings()
 
 
 def rows_to_prune(
-    scene: Path, request: PruneRequest, memory: float | None = None
+    scene: Path, options: PruneOptions, memory: float | None = None
 ) -> PlyRows | None:
     """The rows of a PLY that has to be merged in cells; None if it is pruned in memory: it fits, or
     options need it whole.
 
     Args:
         scene: path of a scene.
-        request: options of pruning.
+        options: options of pruning, and of views: a file of cameras, or sampled views.
         memory: bytes that may be taken; by default what is free.
 
     Raises:
@@ -78,10 +77,10 @@ def rows_to_prune(
     if size <= limit:
         return None
     asked = {
-        f"--by {request.by}": request.method.score is not None,
-        "--sh auto": request.sh == "auto",
-        "--clean": request.clean,
-        f"--keep {request.keep}": found_by_trying(request.budget),
+        f"--by {options.by}": options.method.score is not None,
+        "--sh auto": options.sh == "auto",
+        "--clean": options.clean,
+        f"--keep {options.keep}": found_by_trying(options.budget),
     }
     needing = [name for name, given in asked.items() if given]
     if needing and memory is not None:
@@ -98,11 +97,8 @@ def rows_to_prune(
 def prune_file(
     rows: PlyRows,
     output: Path,
-    request: PruneRequest,
+    options: PruneOptions,
     memory: float | None = None,
-    poses: Path | None = None,
-    resolution: tuple[int, int] | None = None,
-    up: Up | None = None,
     progress: Progress = silent,
     jobs: int = 1,
 ) -> tuple[int, float]:
@@ -112,10 +108,8 @@ def prune_file(
     Args:
         rows: the scene, as of :func:`rows_to_prune`.
         output: the PLY to write.
-        request: options of pruning.
+        options: options of pruning, and of views: a file of cameras, or sampled views.
         memory: bytes that may be taken; more than the largest cell takes change nothing.
-        poses: a file of cameras; by default views are sampled.
-        resolution, up: as of :class:`~pointsplat_ns.pipeline.view_provider.ViewSource`.
         jobs: number of processes that share the cells, each within ``memory``.
 
     Returns:
@@ -135,9 +129,9 @@ def prune_file(
             f"{output}: is written as a whole; expected a .ply for a scene larger than memory, "
             "which `pointsplat convert` changes"
         )
-    if request.sh.isdigit():
+    if options.sh.isdigit():
         rows = copy.copy(rows)
-        rows.rest = min(rows.rest, (int(request.sh) + 1) ** 2 - 1)
+        rows.rest = min(rows.rest, (int(options.sh) + 1) ** 2 - 1)
     most = MEMORY.most
     if memory is not None:
         each = _row_bytes(rows) + MEMORY.cell
@@ -148,7 +142,9 @@ def prune_file(
                 f"{bytes_text(needed)}"
             )
         most = min(most, int((memory - MEMORY.base) / each))
-    given = None if poses is None or without_poses(poses) else poses
+    given = None if options.sampled else options.poses
+    resolution = options.size
+    up = options.upward
     file = None if given is None else PosesFile.of(rows.path, given).relative_to(rows.traits.offset)
     known = None if file is None else file.views
     if known is not None and resolution is not None:
@@ -159,7 +155,7 @@ def prune_file(
         "bytes": status.st_size,
         "changed": status.st_mtime_ns,
         "rest": rows.rest,
-        "keep": str(request.keep),
+        "keep": str(options.keep),
         "most": most,
         "views": _digest(known),
         "resolution": list(resolution or RESOLUTION),
@@ -175,7 +171,7 @@ def prune_file(
         return known.spread(VIEW_COUNTS.weighed)
 
     def count_of(n: int) -> int:
-        count = request.count_of(n, rows.sh_degree, rows.traits)
+        count = options.count_of(n, rows.sh_degree, rows.traits)
         assert count is not None
         return count
 

@@ -1,8 +1,8 @@
-"""How close a written scene is to the dense scene: one judgement, which commands, pages and
-pictures say in one text.
+"""How close a written scene is to the dense scene: one judgement, reported identically by commands,
+pages and pictures.
 
-Renders are compared in the views of :meth:`~pointsplat_ns.pipeline.view_provider.ViewSource.whole`, at the
-size that people look at, in few of their pixels. For PSNR these are every k-th
+Renders are compared in the views of :meth:`~pointsplat_ns.pipeline.view_provider.ViewProvider.whole`,
+at the size that people look at, in few of their pixels. For PSNR these are every k-th
 (:mod:`~pointsplat_ns.rendering.comparison.sizes`). SSIM needs neighbours, so it takes bands of rows of each
 view, at other heights in each.
 """
@@ -11,18 +11,17 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.metrics import SSIM_WINDOW
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewOrigin, ViewProvider
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.rendering.comparison.closeness import DenseReference, views_text
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.rendering.comparison.sizes import subsampled
 from pointsplat_ns.scene.formats import Format, format_to_write
@@ -31,20 +30,6 @@ from pointsplat_ns.scene.usable import usable_part
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.system.tensors import DOUBLES, INDICES
 from pointsplat_ns.system.threads import one_thread_each
-
-WORDS = (
-    (40.0, "looks the same"),
-    (34.0, "hardly any difference"),
-    (29.0, "finest details soften"),
-    (25.0, "edges of small things blur"),
-    (21.0, "small things are lost"),
-    (0.0, "only large shapes are left"),
-)
-"""The plain word for a PSNR against the dense scene, dB, from its lower bound on: what was seen in
-pictures of rooms, statues, a robot and stones at 50, 30, 10 and 3 % of their Gaussians."""
-
-MOST_SAID = 60.0
-"""PSNR from which on the text gives a bound, dB: the rounding of pictures to 256 levels has 59."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +52,7 @@ JUDGING = JudgingSettings()
 
 @dataclass(frozen=True)
 class PhotoGain:
-    """What training on photos brought."""
+    """What training on photos gained."""
 
     before: float
     """PSNR in the compared photos before, dB."""
@@ -75,20 +60,13 @@ class PhotoGain:
     """The same after."""
     photos: int
     """Number of the compared photos."""
-    kept: bool
-    """Whether the scene after it was kept."""
-
-    def __str__(self) -> str:
-        if self.kept:
-            return f"{self.before:.1f} -> {self.after:.1f} dB in {self.photos} training photos"
-        return (
-            f"{self.before:.1f} dB in {self.photos} photos, which training on them does not raise"
-        )
+    accepted: bool
+    """Whether the scene after it is the result."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """How close a scene is to the dense scene. As text it is the line that users read."""
+    """How close a scene is to the dense scene."""
 
     psnr: float
     """PSNR over the pixels that the dense scene covers, dB; inf if nothing differs."""
@@ -103,48 +81,14 @@ class Quality:
     """Width of their pictures, pixels."""
     height: int
     """Height of their pictures, pixels."""
-    origin: str
-    """Text on the origin of the views."""
+    origin: ViewOrigin | None
+    """Where the views came from."""
     fill_before: float
     """Mean number of Gaussians of the dense scene that viewers draw on a pixel."""
     fill: float
     """The same of the scene."""
     photos: PhotoGain | None = None
     """What photos say, if the scene was trained on some."""
-
-    def __str__(self) -> str:
-        line = quality_line(self.psnr, self.ssim)
-        if self.photos is None:
-            return line
-        if not self.photos.kept:
-            return f"{self.photos}; {line}"
-        return f"{self.photos}; {line.partition(': ')[0]} against the dense scene"
-
-    @property
-    def details(self) -> str:
-        """A line with the other figures."""
-        views = f"{views_text(self.views)} of {self.width} x {self.height} pixels"
-        fills = f"{self.fill_before:.1f} -> {self.fill:.1f} Gaussians drawn per pixel"
-        return f"in {views} ({self.origin}), {decibels(self.worst)} in the worst; fill: {fills}"
-
-    def as_dict(self) -> dict[str, Any]:
-        """The figures and the text, for JSON."""
-        return {**asdict(self), "quality": str(self)}
-
-
-def decibels(psnr: float) -> str:
-    """A PSNR as text."""
-    return f"more than {MOST_SAID:g} dB" if psnr > MOST_SAID else f"{psnr:.1f} dB"
-
-
-def word_for(psnr: float) -> str:
-    """What a PSNR against the dense scene, dB, looks like."""
-    return next((word for least, word in WORDS if psnr >= least), WORDS[-1][1])
-
-
-def quality_line(psnr: float, ssim: float | None) -> str:
-    """The line that users read of a PSNR, dB, and SSIM against the dense scene."""
-    return decibels(psnr) + ("" if ssim is None else f", SSIM {ssim:.2f}") + f": {word_for(psnr)}"
 
 
 class Judge:
@@ -158,16 +102,11 @@ class Judge:
         DataError: if there is no place to look from.
     """
 
-    def __init__(self, dense: Gaussians, source: ViewSource):
+    def __init__(self, dense: Gaussians, source: ViewProvider):
         self.dense = dense
         self.views = source.whole()
         self.origin = source.origin
         self.side = max(self.views.width, self.views.height)
-
-    @property
-    def where(self) -> str:
-        """Text: the number of views, and their size."""
-        return f"{views_text(len(self.views))} of {self.views.width} x {self.views.height} pixels"
 
     @cached_property
     def _pixels(self) -> DenseReference:
@@ -198,13 +137,22 @@ class Judge:
     @one_thread_each()  # views are drawn at once, and what is left are small operations
     def quality(self, scene: Gaussians) -> Quality:
         """The judgement of a scene."""
-        (psnr, worst) = self.psnr(scene)
+        psnr, worst = self.psnr(scene)
         similarity = None
         if self._bands is not None:
             covered = sum(self._bands.covered) / len(self._bands.covered)
             similarity = 1 - (1 - self._bands.ssim(self._placed(scene))) / (covered or 1.0)
-        views = (len(self.views), self.views.width, self.views.height, self.origin)
-        return Quality(psnr, worst, similarity, *views, self._fill, fill(scene, self.views))
+        return Quality(
+            psnr=psnr,
+            worst=worst,
+            ssim=similarity,
+            views=len(self.views),
+            width=self.views.width,
+            height=self.views.height,
+            origin=self.origin,
+            fill_before=self._fill,
+            fill=fill(scene, self.views),
+        )
 
     @cached_property
     def _fill(self) -> float:
@@ -219,7 +167,7 @@ def quality_of_file(judge: Judge | None, scene: Gaussians, path: Path) -> Qualit
     return None if judge is None else judge.quality(read_back(scene, path, format_to_write(path)))
 
 
-def judge_of(dense: Gaussians, source: ViewSource) -> Judge | None:
+def judge_of(dense: Gaussians, source: ViewProvider) -> Judge | None:
     """The judge of a scene; None if there is no place to look from."""
     try:
         return Judge(dense, source)

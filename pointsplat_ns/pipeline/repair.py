@@ -16,23 +16,13 @@ from torch import Tensor
 
 from pointsplat_ns.pipeline.feedback_features import REPAIR, Feedback
 from pointsplat_ns.pipeline.optimiser import TOGETHER, optimised
-from pointsplat_ns.pipeline.options import STEPS, Effort, RepairBudget
 from pointsplat_ns.pipeline.photos.examples import Example, render_of
+from pointsplat_ns.pipeline.repair_budget import RepairBudget
 from pointsplat_ns.pipeline.repair_state import Unfinished
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.refinement.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.rendering.comparison.sizes import SMALLEST_SIDE
 from pointsplat_ns.scene.gaussians import Gaussians
-
-__all__ = [
-    "STEPS",
-    "Effort",
-    "RepairBudget",
-    "Repaired",
-    "repair",
-    "rate_factor",
-    "initial_rate_factor",
-]
 
 
 @dataclass(frozen=True)
@@ -49,7 +39,7 @@ class Repaired:
 def repair(
     scene: Gaussians,
     dense: Gaussians,
-    views: ViewSource,
+    views: ViewProvider,
     budget: RepairBudget,
     progress: Callable[[float], None] | None = None,
     network: FeedbackRefiner | Literal["shipped"] | None = "shipped",
@@ -61,7 +51,7 @@ def repair(
 
     Each step renders both scenes in one view. A network reads the gradients of each Gaussian and
     sets how far it moves (:mod:`~pointsplat_ns.refinement.feedback`). The views come from
-    :meth:`ViewSource.others`: other views than those of comparisons, each once before any is
+    :meth:`ViewProvider.others`: other views than those of comparisons, each once before any is
     repeated. Ctrl-C ends the repair, and the scene of the last step is returned.
 
     Args:
@@ -166,7 +156,7 @@ class OptimisationRun:
 
 
 def _examples(
-    dense: Gaussians, views: ViewSource, growth: float, taken: int = 0
+    dense: Gaussians, views: ViewProvider, growth: float, taken: int = 0
 ) -> Iterator[Callable[[], Example]]:
     """Views after those ``taken``, and renders of the dense scene in them, without end.
 

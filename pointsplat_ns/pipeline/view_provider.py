@@ -1,15 +1,17 @@
-"""The source of a scene's views: given views, the poses of its dataset, or sampled poses."""
+"""Provides the views of a scene: given views, the poses of its dataset, or sampled poses."""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.pipeline.run_data import run_data
 from pointsplat_ns.rendering.comparison.sizes import (
     RESOLUTION,
     SMALLEST_SIDE,
@@ -44,16 +46,35 @@ class ViewCounts:
 VIEW_COUNTS = ViewCounts()
 
 
-class ViewSource:
+class Origin(Enum):
+    """Where views come from."""
+
+    GIVEN = "given"
+    DATASET = "dataset"
+    SAMPLED = "sampled"
+
+
+@dataclass(frozen=True)
+class ViewOrigin:
+    """Where the views of a scene came from."""
+
+    kind: Origin
+    up: Up | None = None
+    """The axis that is up, of sampled views."""
+    missing: str = ""
+    """Why the dataset of the scene's run gives no poses; empty if it does, or there is no run."""
+
+
+class ViewProvider:
     """Views of a scene, looked up or sampled when they are first needed (a budget in Gaussians
     needs none).
 
     Args:
         scene: the scene that the views are for.
-        given: views to use; ``run`` and ``dataset_views`` are then ignored.
+        given: views to use; ``run`` is then ignored.
         run: the file or folder that the scene was read from. If it is a run whose data is found,
             its training poses are used.
-        dataset_views: function that reads the poses of a run's dataset.
+        data: where the run's data is now, if it moved.
         resolution: width and height, pixels, of the pictures that people look at. By default given
             views and photos have their own, and sampled views 1920 x 1080.
         up: which way is up, for sampled views; by default what the scene declares, or estimated.
@@ -64,26 +85,20 @@ class ViewSource:
         scene: Gaussians,
         given: Views | None = None,
         run: Path | str | None = None,
-        dataset_views: Callable[[Path | str], Views] | None = None,
+        data: Path | str | None = None,
         resolution: tuple[int, int] | None = None,
         up: Up | None = None,
     ):
-        self._resolution = resolution
-        self._up = up
         self._scene = scene
         self._given = given
         self._run = run
-        self._dataset_views = dataset_views
-        self.origin = ""
-        """Text that says where views came from; empty until there are some."""
+        self._data = data
+        self._resolution = resolution
+        self._up = up
+        self.origin: ViewOrigin | None = None
+        """Where views came from; None until there are some."""
         self.missing = ""
-        """Text in brackets that says why a run's dataset gives no poses; empty if it does, or was
-        not looked for."""
-
-    @property
-    def text(self) -> str:
-        """A line on :attr:`origin`."""
-        return f"views: {self.origin}"
+        """Why a run's dataset gives no poses; empty if it does, or was not looked for."""
 
     @property
     def given(self) -> Views | None:
@@ -92,16 +107,16 @@ class ViewSource:
 
     @cached_property
     def _of_dataset(self) -> Views | None:
-        if self._run is None or self._dataset_views is None or not may_be_run(self._run):
+        if self._run is None or not may_be_run(self._run):
             return None
         try:
             open_run(self._run, need_data=False)
         except SceneError:
             return None  # a checkpoint outside a run
         try:
-            return self._dataset_views(self._run)
+            return run_data().views(self._run, "train", self._data)
         except (SceneError, DataError) as error:
-            self.missing = f" (no dataset: {error})"
+            self.missing = str(error)
             return None
 
     @property
@@ -114,7 +129,7 @@ class ViewSource:
         if there are none."""
         if self._known is None:
             return None
-        self.origin = "poses of the dataset" if self.given is None else "given views"
+        self.origin = ViewOrigin(Origin.DATASET if self.given is None else Origin.GIVEN)
         return self._at_resolution(self._known.spread(count))
 
     def views(self, count: int) -> Views:
@@ -128,7 +143,7 @@ class ViewSource:
         views = self.known(count)
         if views is None:
             views = self.sampler.views(count)
-            self.origin = f"sampled poses, up is {self.sampler.up}{self.missing}"
+            self.origin = ViewOrigin(Origin.SAMPLED, self.sampler.up, self.missing)
         return views
 
     @cached_property

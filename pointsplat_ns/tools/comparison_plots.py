@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,18 +13,20 @@ from numpy.typing import ArrayLike
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.pipeline.cleaning import clusters
 from pointsplat_ns.pipeline.quality import Quality
-from pointsplat_ns.pipeline.report import Compacted
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pipeline.report import Report
+from pointsplat_ns.pipeline.run import Cleaned
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.rendering import render, render_with_alpha
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.scene.views import Views, spread_indices
+from pointsplat_ns.scene.views import spread_indices
 from pointsplat_ns.system.files import replacing
+from pointsplat_ns.tools.wording import STAGES, origin_text, quality_lines
 
 
 @torch.no_grad()
 def plot_comparison(
     dense: Gaussians,
-    result: Compacted,
+    result: Report,
     path: Path | str,
     files: Sequence[str] = ("", ""),
     quality: Quality | None = None,
@@ -67,14 +68,13 @@ def plot_comparison(
     scenes = []
     for stage in result.stages:
         if stage.after is not None:
-            names.append(stage.done if stage.accepted else f"{stage.done} (left out)")
+            done = STAGES[stage.stage]
+            names.append(done if stage.accepted else f"{done} (left out)")
             last = stage is result.last
-            said = (
-                [files[1], "" if quality is None else re.sub("[:;] ", "\n", str(quality))]
-                if last
-                else []
-            )
-            titles.append(_title(names[-1], stage.scene, *said))
+            lines: tuple[str, ...] = ()
+            if last:
+                lines = (files[1], *(() if quality is None else quality_lines(quality)))
+            titles.append(_title(names[-1], stage.scene, *lines))
             scenes.append(stage.scene)
     rows = [
         [renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in rows_of
@@ -83,12 +83,12 @@ def plot_comparison(
     return f"{path}: {', '.join(names)}, side by side"
 
 
-def _title(name: str, scene: Gaussians, *said: str) -> str:
-    return "\n".join([name, f"{len(scene):,} Gaussians", *said])
+def _title(name: str, scene: Gaussians, *lines: str) -> str:
+    return "\n".join([name, f"{len(scene):,} Gaussians", *lines])
 
 
 @torch.no_grad()
-def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
+def plot_views(dense: Gaussians, source: ViewProvider, path: Path | str) -> str:
     """Draw up to 16 of the views that decide about a scene, as a sheet of four columns.
 
     Args:
@@ -111,19 +111,20 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
     side_by_side(rows, [""] * columns, path)
     return (
         f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; "
-        f"{source.origin}"
+        f"{origin_text(source.origin)}"
     )
 
 
 @torch.no_grad()
-def plot_cleaning(
-    dense: Gaussians, gone: Gaussians, cleaned: Gaussians, views: Views, path: Path | str
-) -> None:
+def plot_cleaning(done: Cleaned, path: Path | str) -> None:
     """Draw the three of some views in which most pixels go: the dense scene; what goes, before the
-    scene in grey, the ten largest clusters in colours of their own; and the cleaned scene. ``gone``
-    may hold what cannot be drawn."""
+    scene in grey, the ten largest clusters in colours of their own; and the cleaned scene."""
     from matplotlib import colormaps
 
+    dense = done.dense
+    cleaned = done.scene
+    views = done.views.scored(VIEW_COUNTS.scored)
+    gone = dense[done.cleaning.junk.first(len(dense) - 1).indices.to(dense.device)]
     gone = gone[gone.usable()]
     colors = torch.from_numpy(colormaps["tab10"](np.arange(10))[:, :3])[clusters(gone).clamp_max(9)]
     marked = gone.replace(

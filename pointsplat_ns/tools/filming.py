@@ -8,16 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.api import load
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
-from pointsplat_ns.pipeline.requests import Looking, Source, read_source
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.options import NO_POSES, ViewOptions
+from pointsplat_ns.pipeline.subject import Source, read_subject
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.scene.formats.sog_stream import coarser_levels
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.progress import Progress, tracked
+from pointsplat_ns.tools.loading import load
 from pointsplat_ns.tools.pages.film import PHOTO_SIDE, FilmSettings, camera_path, render_frames
 from pointsplat_ns.tools.pages.video import check_output, write_frames
 from pointsplat_ns.view_sampling.upright import up_named
@@ -86,13 +86,15 @@ def render_path(
         5
     """
     settings = FilmSettings(width, height, fps, seconds)
-    looking = Looking(views, up=up, data=data)
+    given = views if isinstance(views, Views) else None
+    options = ViewOptions(poses=None if isinstance(views, Views) else views, up=up, data=data)
+    options.check()
     kind = check_output(output, force)
-    dense, source = read_source(scene, looking)
-    if source.given is not None and not isinstance(
-        views, Views
-    ):  # from a file, as large as its photos
-        source = ViewSource(dense, source.given.resized(PHOTO_SIDE))
+    subject = read_subject(scene, options, given)
+    dense = subject.dense
+    source = subject.views()
+    if source.given is not None and given is None:  # from a file, as large as its photos
+        source = ViewProvider(dense, source.given.resized(PHOTO_SIDE))
     sources = [scene]
     loaded = [dense]
     if other is not None:
@@ -100,7 +102,7 @@ def render_path(
         loaded.append(_loaded(other).at_offset(dense.offset))
     if source.given is not None and kind == "frames" and seconds is None:
         settings = replace(settings, seconds=len(source.given) / fps)
-    cameras, origin = camera_path(dense, source, settings, kind == "picture", looking.upward)
+    cameras, origin = camera_path(dense, source, settings, kind == "picture", options.upward)
     names = [
         f"{_name(s, i)}, {len(g):,} Gaussians"
         for i, (s, g) in enumerate(zip(sources, loaded, strict=True))
@@ -159,18 +161,21 @@ def open_viewer(
     upward = up_named(up)
 
     def read(path: Path, name: str) -> ViewedScene:
-        return ViewedScene(name, None, *read_source(path, Looking("none")))
+        subject = read_subject(path, ViewOptions(poses=NO_POSES))
+        return ViewedScene(name, None, subject.dense, subject.views())
 
     scenes: list[ViewedScene] = []
     for index, shown in enumerate(one for one in (scene, other) if one is not None):
         path = None if isinstance(shown, Gaussians) else Path(shown)
         if scenes:
             loaded = _loaded(shown).at_offset(scenes[0].scene.offset)
-            source = view_source(loaded, run=path)
-        else:
-            loaded, source = read_source(
-                shown, Looking(views, data=data)
-            )  # upward is the page's, not merging's
+            source = ViewProvider(loaded, run=path)
+        else:  # ``upward`` is the page's, not merging's
+            given = views if isinstance(views, Views) else None
+            named = None if isinstance(views, Views) else views
+            subject = read_subject(shown, ViewOptions(poses=named, data=data), given)
+            loaded = subject.dense
+            source = subject.views()
         levels = (
             []
             if path is None or (path / RUN_FILES.config).is_file()

@@ -23,14 +23,14 @@ from typing import Any, Literal
 import torch
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
-from pointsplat_ns.pipeline.compact import compact_scene, compact_to_psnr
-from pointsplat_ns.pipeline.options import CompactRequest, Effort, RepairBudget
-from pointsplat_ns.pipeline.quality import judge_of, quality_line, read_back
+from pointsplat_ns.pipeline.compact import compact_scene, compact_to_quality
+from pointsplat_ns.pipeline.options import CompactOptions
+from pointsplat_ns.pipeline.quality import judge_of, read_back
+from pointsplat_ns.pipeline.repair_budget import Effort
 from pointsplat_ns.pipeline.trained_refiner import load_refiner
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import Keep
-from pointsplat_ns.rendering.comparison.sizes import parse_resolution, size_text
+from pointsplat_ns.rendering.comparison.sizes import size_text
 from pointsplat_ns.scene.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.scene.formats import format_like, format_to_write
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -53,6 +53,7 @@ from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.system.workers import Workers, check_jobs
 from pointsplat_ns.tools.pages.gallery import draw_pair, pair_of, write_gallery, write_sheet
+from pointsplat_ns.tools.wording import quality_line
 
 FIGURES = ("before", "after", "megabytes_before", "megabytes", "psnr", "seconds")
 """Numbers of a result in its record."""
@@ -109,6 +110,7 @@ def compact_folder(
     refiner: str | Path | None = None,
     *,
     by: str | None = None,
+    opacity_weight: float | None = None,
     sh: str = "all",
     clean: bool = False,
     effort: Effort = "quick",
@@ -137,7 +139,7 @@ def compact_folder(
             written.
         keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format.
         refiner: as for :func:`~pointsplat_ns.load_refiner`; None for no refiner.
-        by, sh, clean, effort, seconds, target_db, resolution: as for :func:`compact`, for each
+        by, opacity_weight, sh, clean, effort, seconds, target_db, resolution: as for :func:`compact`, for each
             scene.
         data: folder above the data of the runs. A run whose data is not found gets sampled views,
             and a note.
@@ -173,14 +175,23 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder) if output is None else Path(output)
-    size = parse_resolution(resolution)
     trained = None if refiner is None else _loaded(refiner)
-    request = CompactRequest.of(
-        trained, keep, by, sh, clean, RepairBudget(effort, seconds), target_db=target_db
-    )
-    options: dict[str, str | float | bool | None] = {
-        "keep": str(request.prune.budget),
-        "by": request.prune.by,
+    options = CompactOptions(
+        keep=keep,
+        by=by or "",
+        opacity_weight=opacity_weight,
+        sh=sh,  # type: ignore[arg-type]
+        clean=clean,
+        effort=effort,
+        seconds=seconds,
+        target_db=target_db,
+        resolution=resolution,
+        data=data,
+    ).completed(trained)
+    size = options.size
+    record: dict[str, str | float | bool | None] = {
+        "keep": str(options.budget),
+        "by": options.by,
         "sh": sh,
         "clean": clean,
         "effort": effort,
@@ -205,11 +216,9 @@ def compact_folder(
         _Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
         for name, path in find_scenes(folder).items()
     ]
-    _describe(target, options, force)
+    _describe(target, record, force)
     drawn = (page, sheet) != (None, None)
-    work = _Compacting(
-        dataclasses.replace(request, refiner=None), refiner, size, data, options, drawn, force
-    )
+    work = _Compacting(options, refiner, record, drawn, force)
     results: dict[str, SceneResult] = {}
     try:
         with progress_bar(progress) as report, Workers(work, jobs) as workers:
@@ -285,11 +294,9 @@ def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
 class _Compacting:
     """Compacts a scene of a folder, unless that is done. It is pickled for other processes."""
 
-    request: CompactRequest  # without the refiner
+    options: CompactOptions
     refiner: str | Path | None  # loaded by each process
-    resolution: tuple[int, int] | None
-    data: str | Path | None
-    options: Mapping[str, Any]
+    record: Mapping[str, Any]  # what tells results of other options apart
     drawn: bool  # whether a picture of each scene before and after is wanted
     force: bool
 
@@ -301,7 +308,7 @@ class _Compacting:
             for part in source_parts(task.source):
                 require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
             source = source_file(task.source)
-            text = json.dumps([source.sha256, self.options], sort_keys=True)
+            text = json.dumps([source.sha256, self.record], sort_keys=True)
             key = hashlib.sha256(text.encode()).hexdigest()
             record = _read_record(task)
             whole = (
@@ -334,18 +341,18 @@ class _Compacting:
         scene is open."""
         dense = read_scene(task.source)
         kind = format_to_write(task.output)
-        source = view_source(dense, run=task.source, data=self.data, resolution=self.resolution)
-        prune = dataclasses.replace(self.request.prune, suffix=kind.suffix)
+        options = dataclasses.replace(self.options, target_format=kind.suffix)
+        views = ViewProvider(dense, run=task.source, data=options.data, resolution=options.size)
         trained = None if self.refiner is None else _loaded(self.refiner)
-        request = dataclasses.replace(self.request, prune=prune, refiner=trained)
-        made = (compact_to_psnr if request.searched else compact_scene)(dense, request, source)
+        compact = compact_to_quality if options.searched else compact_scene
+        made = compact(dense, options, views, refiner=trained)
         if made.interrupted:
             raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
         scene = made.scene
         same = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
         same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
         differs = not same or kind.suffix != ".ply"
-        judge = (made.judge or judge_of(dense, source)) if differs else None
+        judge = (made.judge or judge_of(dense, views)) if differs else None
         with replacing(task.output) as part:
             save_as(kind, scene, part, name=task.output)
             written = read_back(scene, part, kind)
@@ -358,11 +365,11 @@ class _Compacting:
                 megabytes=part.stat().st_size / 1e6,
                 psnr=psnr if math.isfinite(psnr) else None,
                 seconds=time.perf_counter() - start,
-                note="kept whole" if same else source.missing[2:-1],
+                note="kept whole" if same else f"no dataset: {views.missing}" * bool(views.missing),
             )
             for old in (task.output, pair_of(task.output)):  # must not stand beside the new record
                 old.unlink(missing_ok=True)
-            proofs = {"key": key, "options": self.options, "sha256": content_hash(part)}
+            proofs = {"key": key, "options": self.record, "sha256": content_hash(part)}
             write_json({**dataclasses.asdict(done), **proofs}, task.record)
         if self.drawn:
             self._draw(task, dense, written)
@@ -371,9 +378,9 @@ class _Compacting:
     def _draw(self, task: _Task, before: Gaussians, after: Gaussians) -> None:
         """Draw a scene and its result to a file; nothing if nothing of the scene is visible."""
         after = after if after.offset is None else after.at_offset(before.offset)
-        known = view_source(before, run=task.source, data=self.data).known(VIEW_COUNTS.opening)
+        views = ViewProvider(before, run=task.source, data=self.options.data)
         with suppress(DataError):
-            draw_pair(before, after, known, pair_of(task.output))
+            draw_pair(before, after, views.known(VIEW_COUNTS.opening), pair_of(task.output))
 
 
 def _read_record(task: _Task) -> dict[str, Any] | None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import SHORTEST
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.rendering.comparison.sizes import parse_resolution
@@ -124,7 +124,7 @@ def info(
     scene = scene.detach().to("cpu", torch.float32)
     usable = scene.usable()
     good = scene[usable]
-    source = ViewSource(good, resolution=size, up=known)
+    source = ViewProvider(good, resolution=size, up=known)
     try:
         views = source.whole()
         up_found: Up | None = source.sampler.up

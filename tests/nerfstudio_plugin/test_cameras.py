@@ -26,7 +26,7 @@ from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConf
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, UndistortedDataset
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
-from pointsplat_ns.pipeline.options import PHOTO_STEPS
+from pointsplat_ns.pipeline.repair_budget import PHOTO_STEPS
 from pointsplat_ns.scene.image_files import in_unit_range
 from pointsplat_ns.scene.views import EPS2D, NEAR_PLANE, Views
 

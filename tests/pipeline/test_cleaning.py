@@ -19,9 +19,9 @@ from pointsplat_ns.pipeline.cleaning import (
     find_junk,
     floating_scores,
 )
-from pointsplat_ns.pipeline.options import PruneRequest
+from pointsplat_ns.pipeline.options import PruneOptions
 from pointsplat_ns.pipeline.prune import prune_scene
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -94,8 +94,8 @@ def with_junk(room: Gaussians) -> Gaussians:
 def test_nothing_of_a_clean_room_is_touched():
     thin = box_room(0)  # every Gaussian of its walls is seen
     assert junk_of(thin) == ([], [])
-    result = prune_scene(thin, PruneRequest(0.4, "opacity", clean=True))
-    assert same_bits(result.scene, prune_scene(thin, PruneRequest(0.4, "opacity")).scene)
+    result = prune_scene(thin, PruneOptions(0.4, "opacity", clean=True))
+    assert same_bits(result.scene, prune_scene(thin, PruneOptions(0.4, "opacity")).scene)
     assert result.notes == ("clean: nothing removed",)
 
 
@@ -143,7 +143,9 @@ def test_of_alike_ones_those_that_show_stay(scene, most):
 )
 def test_keep_refers_to_the_scene_as_read_and_is_exact(by, keep, room, views):
     scene = with_junk(room)[:-2] if by == "merge" else with_junk(room)
-    result = prune_scene(scene, PruneRequest(keep, by, clean=True), ViewSource(scene, given=views))
+    result = prune_scene(
+        scene, PruneOptions(keep, by, clean=True), ViewProvider(scene, given=views)
+    )
     assert len(result.scene) == resolve_keep(len(scene), keep)
     if keep == 0.3:
         assert int((result.scene.means[:, 0].abs() > 3).sum()) == 0
@@ -151,8 +153,8 @@ def test_keep_refers_to_the_scene_as_read_and_is_exact(by, keep, room, views):
 
 def test_a_quality_that_takes_junk_gets_it_back(room, views):
     scene = Gaussians.cat([room, JUNK["floaters"]])
-    source = ViewSource(scene, given=views)
-    easy = prune_scene(scene, PruneRequest(WithinPsnr(12.0), "coverage", clean=True), source)
+    source = ViewProvider(scene, given=views)
+    easy = prune_scene(scene, PruneOptions(WithinPsnr(12.0), "coverage", clean=True), source)
     assert len(easy.scene) < ROOM and int((easy.scene.means[:, 0].abs() > 3).sum()) == 0
     cleaning_of = clean_scene(scene, 1, source)
     for count in (len(scene), len(scene) - 1, len(scene) - 5):
@@ -167,7 +169,7 @@ def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
     scene = with_junk(box_room(0, 40, size=0.05))
     junk = find_junk(scene)
     assert junk.places == 0 and len(junk.unseen) == 0
-    (first, second) = clean_scene(scene, 1, ViewSource(scene)).notes
+    (first, second) = clean_scene(scene, 1, ViewProvider(scene)).notes
     assert first == f"clean: 2 of {len(scene)} removed that cannot be drawn"
     assert second.endswith("(nothing to look from was found)")
 
@@ -208,7 +210,7 @@ def test_what_a_given_view_shows_is_not_unseen(room):
     near = {*range(ROOM + 1, ROOM + PLANTED, 2)}  # those on the side of the camera
     cleanings = [
         clean_scene(scene, 1, source)
-        for source in (ViewSource(scene, given=behind), ViewSource(scene))
+        for source in (ViewProvider(scene, given=behind), ViewProvider(scene))
     ]
     assert [near & {*cleaning.junk.unseen.tolist()} for cleaning in cleanings] == [set(), near]
     assert not any(

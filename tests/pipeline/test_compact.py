@@ -8,15 +8,16 @@ import pytest
 import torch
 
 import pointsplat_ns.pipeline.compact as compact_module
+import pointsplat_ns.pipeline.stages as stages_module
 from making import ball, same
+from pointsplat_ns.api import Compacted
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.pipeline.acceptance import closer_in
 from pointsplat_ns.pipeline.compact import compact_scene
-from pointsplat_ns.pipeline.options import CompactRequest, RepairBudget
+from pointsplat_ns.pipeline.options import CompactOptions
 from pointsplat_ns.pipeline.repair import Repaired
-from pointsplat_ns.pipeline.report import Compacted
 from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import PruneSettings, prune
 from pointsplat_ns.refinement import Refiner, RefinerConfig
 from pointsplat_ns.rendering.comparison.closeness import Closeness, DenseReference
@@ -59,19 +60,21 @@ def trained(
     return TrainedRefiner(refiner, PruneSettings(keep, by, **options), Path("in memory"))
 
 
-REPAIRED = RepairBudget("quick", 1.0)
+REPAIRED = {"effort": "quick", "seconds": 1.0}
 
 
 def compacted(
     scene: Gaussians,
     refiner: TrainedRefiner | None,
-    views: Views | ViewSource | None,
+    views: Views | ViewProvider | None,
     progress=silent,
     **options,
 ) -> Compacted:
     """Compacted with renders compared in the given views."""
-    source = ViewSource(scene, given=views) if isinstance(views, Views) else views
-    return compact_scene(scene, CompactRequest.of(refiner, **options), source, progress)
+    source = ViewProvider(scene, given=views) if isinstance(views, Views) else views
+    asked = CompactOptions(**{"effort": "instant", **options}).completed(refiner)
+    made = compact_scene(scene, asked, source, progress, refiner=refiner)
+    return Compacted(**vars(made))
 
 
 @pytest.fixture
@@ -80,13 +83,13 @@ def repaired_to(monkeypatch):
 
     def give(made: Gaussians, interrupted: bool = False) -> None:
         monkeypatch.setattr(
-            compact_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, interrupted)
+            stages_module, "repair", lambda *_, **others: Repaired(made, 5, 0.5, interrupted)
         )
 
     return give
 
 
-class NoViews(ViewSource):
+class NoViews(ViewProvider):
     """Of a scene without a place to look at it from."""
 
     def views(self, count: int) -> Views:
@@ -119,7 +122,7 @@ def test_what_is_not_finite_never_gets_out(scene, views):
             return scene.replace(means=means)
 
     unsound = Unsound(refiner.config).eval()
-    for source in (ViewSource(scene, given=views), NoViews(scene)):
+    for source in (ViewProvider(scene, given=views), NoViews(scene)):
         result = compacted(scene, trained(unsound), source)
         assert (
             not result.accepted and same(result.scene, pruned) and result.stages[-1].after is None
@@ -181,7 +184,7 @@ def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(
     pruned = prune(scene, 0.5, "opacity")
     made = change(pruned)
     repaired_to(made, interrupted=not kept)
-    result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
+    result = compacted(scene, trained(tiny_refiner()), views, **REPAIRED)
     assert result.repair_accepted == kept
     assert same(result.scene, made if kept else pruned)
     assert (
@@ -206,11 +209,11 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired
         )
 
     monkeypatch.setattr(DenseReference, "closeness", closeness)
-    result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, repair=REPAIRED)
+    result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, **REPAIRED)
     assert same(result.scene, pruned) and result.repaired.after.psnr > result.before.psnr + 3
     assert closer_in(result.before, result.repaired.after) == 1
-    assert result.verdict.startswith("not refined by the network, it is farther in most views: ")
-    assert "not repaired by 5 steps in 0.5 s, it is farther in most views: " in result.verdict
+    assert result.verdict.startswith("not refined by the network, error increased in most views: ")
+    assert "not repaired by 5 steps in 0.5 s, error increased in most views: " in result.verdict
 
 
 def test_a_repair_that_harms_pictures_of_another_size_is_left_out(scene, monkeypatch, repaired_to):
@@ -219,7 +222,7 @@ def test_a_repair_that_harms_pictures_of_another_size_is_left_out(scene, monkeyp
     large = sample_views(scene, 2, 640, 480)
     pruned = prune(scene, 0.5, "opacity")
     repaired_to(pruned.replace(scales=pruned.scales + 0.1))
-    options = {"by": "opacity", "keep": 0.5, "repair": REPAIRED}
+    options = {"by": "opacity", "keep": 0.5, **REPAIRED}
     assert compacted(scene, None, large, **options).repair_accepted
     psnrs = iter([[30.0, 30.0, 30.0], [31.0, 31.0, 29.9], [30.0, 30.0, 30.0], [31.0, 31.0, 28.0]])
     monkeypatch.setattr(RendersOfSizes, "psnrs", lambda self, scene: next(psnrs))

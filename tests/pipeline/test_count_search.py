@@ -15,9 +15,9 @@ from pointsplat_ns.pipeline.budget_search import (
     largest_within,
     smallest_within,
 )
-from pointsplat_ns.pipeline.options import PruneRequest
+from pointsplat_ns.pipeline.options import PruneOptions
 from pointsplat_ns.pipeline.prune import prune_scene
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import METHODS, WithinPsnr, score_of, select
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats import Format, format_to_write
@@ -119,8 +119,8 @@ def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(
     )
     assert all(found.tried[k] < wanted for k in below) and len(found.tried) <= 8
     shares = []
-    request = PruneRequest(WithinPsnr(wanted), "coverage")
-    source = ViewSource(hollow_ball, given=ball_views)
+    request = PruneOptions(WithinPsnr(wanted), "coverage")
+    source = ViewProvider(hollow_ball, given=ball_views)
     pruned = prune_scene(
         hollow_ball,
         request,
@@ -158,7 +158,7 @@ def test_a_size_that_jumps_ends_the_search_with_what_fits():
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".splat", ".ply"])
 def test_prune_counts_bytes_of_the_format_that_is_named(tmp_path, suffix):
     scene = cloud(2000)
-    small = prune_scene(scene, PruneRequest(f"0.02MB{suffix}", "opacity")).scene
+    small = prune_scene(scene, PruneOptions(f"0.02MB{suffix}", "opacity")).scene
     path = tmp_path / f"a{suffix}"
     format_to_write(path).write(small, path, lambda what, share: None)
     assert path.stat().st_size <= 20_000

@@ -12,10 +12,10 @@ import pointsplat_ns as ps
 from making import FewViews, views_from_within
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import rotation_matrices
-from pointsplat_ns.pipeline import compact as compacting
-from pointsplat_ns.pipeline import options as requests
 from pointsplat_ns.pipeline import photo_repair as module
-from pointsplat_ns.pipeline.compact import compact_scene, compact_to_psnr
+from pointsplat_ns.pipeline import repair_budget
+from pointsplat_ns.pipeline import stages as stages_module
+from pointsplat_ns.pipeline.compact import compact_scene, compact_to_quality
 from pointsplat_ns.pipeline.optimiser import (
     RATES,
     Adam,
@@ -25,21 +25,16 @@ from pointsplat_ns.pipeline.optimiser import (
     gradients_of,
     size_factors,
 )
-from pointsplat_ns.pipeline.options import (
-    PHOTO_STEPS,
-    STEPS,
-    CompactRequest,
-    PhotoBudget,
-    PruneRequest,
-    RepairBudget,
-)
+from pointsplat_ns.pipeline.options import CompactOptions
 from pointsplat_ns.pipeline.photo_repair import photo_repair, reallocated, split
 from pointsplat_ns.pipeline.photos import examples
 from pointsplat_ns.pipeline.photos.examples import every_kth_pixel, mean_psnr
 from pointsplat_ns.pipeline.quality import through_file
+from pointsplat_ns.pipeline.repair_budget import PHOTO_STEPS, STEPS, PhotoBudget
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.views import EPS2D
+from pointsplat_ns.tools.wording import stage_text
 from pointsplat_ns.view_sampling.sampler import sample_views
 
 CPU = torch.device("cpu")
@@ -87,7 +82,7 @@ def test_unseen_photos_are_in_no_step_and_the_others_in_turn(
         (8.0, 0.4, 1.5, ["photos"], "trained on 15 photos by 40"),
         (8.0, -0.4, 20.0, ["repair", "photos"], "trained on 15 photos by 40"),
         (8.0, -0.4, 1.5, ["repair", "photos"], "other photos lose"),
-        (1e4, 0.4, 1.5, ["repair", "photos"], "brings less than 0.1 dB"),
+        (1e4, 0.4, 1.5, ["repair", "photos"], "gains less than 0.1 dB"),
     ],
 )
 def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
@@ -98,7 +93,7 @@ def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
     settings = dataclasses.replace(
         module.PHOTO_REPAIR, adam=AdamSettings(faster), most_lost=most_lost
     )
-    for place in (module, compacting):
+    for place in (module, stages_module):
         monkeypatch.setattr(place, "PHOTO_REPAIR", settings)
     scenes = [
         hollow_ball.replace(features_dc=hollow_ball.features_dc + change)
@@ -109,14 +104,12 @@ def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
         Example(view, render(scenes[index % 8 > 0], view).detach())
         for index, view in enumerate(views)
     ]
-    request = CompactRequest(
-        PruneRequest(300), repair=RepairBudget("quick"), photos=PhotoBudget("quick")
-    )
-    result = compact_scene(hollow_ball, request, FewViews(hollow_ball), photos=photos)
+    options = CompactOptions(keep=300, photos=True).completed()
+    result = compact_scene(hollow_ball, options, FewViews(hollow_ball), photos=photos)
     stage = result.stages[-1]
     kept = text.startswith("trained")
-    assert [stage.name for stage in result.stages[1:]] == stages
-    assert stage.accepted == kept and text in result.verdict.splitlines()[-1]
+    assert [stage.stage for stage in result.stages[1:]] == stages
+    assert stage.accepted == kept and text in stage_text(stage)
     assert (result.scene is stage.scene) == kept
     assert stage.photos is not None
     assert stage.photos.before == stage.photos.beside(result.stages[-2].scene, photos).before
@@ -130,21 +123,19 @@ def test_a_large_scene_is_repaired_first_and_more_pixels_are_drawn(
 ):
     settings = dataclasses.replace(module.PHOTO_REPAIR, large=large)
     sides = set()
-    for place in (module, compacting):
+    for place in (module, stages_module):
         monkeypatch.setattr(place, "PHOTO_REPAIR", settings)
     monkeypatch.setattr(
         module,
         "every_kth_pixel",
         lambda photo, side, *rest: sides.add(side) or every_kth_pixel(photo, side, *rest),
     )
-    monkeypatch.setattr(requests, "FEW", 75)
-    request = CompactRequest(
-        PruneRequest(300), repair=RepairBudget("quick"), photos=PhotoBudget("quick")
-    )
-    result = compact_scene(hollow_ball, request, FewViews(hollow_ball), photos=photos)
+    monkeypatch.setattr(repair_budget, "FEW", 75)
+    options = CompactOptions(keep=300, photos=True).completed()
+    result = compact_scene(hollow_ball, options, FewViews(hollow_ball), photos=photos)
     last = result.stages[-1]
     assert (
-        [stage.name for stage in result.stages[1:]] == stages and last.accepted and sides == {side}
+        [stage.stage for stage in result.stages[1:]] == stages and last.accepted and sides == {side}
     )
     assert last.photos is not None
     assert last.photos.before == mean_psnr(
@@ -153,25 +144,23 @@ def test_a_large_scene_is_repaired_first_and_more_pixels_are_drawn(
 
 
 def test_auto_finds_the_smallest_file_that_loses_little_in_held_out_photos(hollow_ball, photos):
-    request = CompactRequest.of(
-        keep="auto", photos=True, suffix=".sog", repair=RepairBudget("quick")
-    )
-    request = dataclasses.replace(
-        request, most_lost=-2.0, repair=RepairBudget("instant")
-    )  # gains 2 dB by the photos
+    asked = CompactOptions(keep="auto", photos=True, target_format=".sog")
+    options = dataclasses.replace(asked.completed(), most_lost=-2.0)  # gains 2 dB by the photos
     training = photos[1:]
     held_out = photos[::8]
-    found = compact_to_psnr(
-        hollow_ball, request, FewViews(hollow_ball), photos=training, held_out=held_out
+    found = compact_to_quality(
+        hollow_ball, options, FewViews(hollow_ball), photos=training, held_out=held_out
     )
     before, after = (
         mean_psnr(s, held_out, [0, 1, 2])
         for s in (hollow_ball, through_file(found.scene, ".sog")[1])
     )
     assert 2.0 <= after - before < 3.0 and len(found.scene) < 0.7 * len(hollow_ball)
-    assert "in 3 held-out photos, the dense scene" in found.target and "sizes tried" in found.target
+    assert found.target is not None
+    assert (found.target.photos, found.target.psnr) == (3, after)
+    assert found.target.dense_psnr == before and found.target.tried > 1
     with pytest.raises(DataError, match="there are no held-out photos"):
-        compact_to_psnr(hollow_ball, request, FewViews(hollow_ball), photos=training)
+        compact_to_quality(hollow_ball, options, FewViews(hollow_ball), photos=training)
 
 
 def test_ctrl_c_gives_the_scene_so_far(hollow_ball, pruned, photos):

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 from making import ball, same
-from pointsplat_ns.pipeline.options import PruneRequest
+from pointsplat_ns.pipeline.options import PruneOptions
 from pointsplat_ns.pipeline.prune import Pruned, prune_scene
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import METHODS, Keep, WithinPsnr, select
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats.spz import encode_spz
@@ -29,15 +29,15 @@ def views(scene) -> Views:
 
 def pruned(
     scene: Gaussians,
-    views: Views | ViewSource | None,
+    views: Views | ViewProvider | None,
     keep: Keep | str,
     by: str = "merge",
     progress=silent,
     **options,
 ) -> Pruned:
     """Pruned with renders compared in the given views."""
-    source = ViewSource(scene, given=views) if isinstance(views, Views) else views
-    return prune_scene(scene, PruneRequest(keep, by, **options), source, progress)
+    source = ViewProvider(scene, given=views) if isinstance(views, Views) else views
+    return prune_scene(scene, PruneOptions(keep, by, **options), source, progress)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from pointsplat_ns.pipeline.quality import (
     quality_of_file,
     through_file,
 )
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.reading import save
@@ -32,7 +32,7 @@ def dense():
 def test_the_figures_are_those_of_whole_pictures_over_covered_pixels(dense):
     small = dense[::3]
     views = sample_views(dense, 3, 64, 48)
-    found = Judge(dense, ViewSource(dense, views)).quality(small)
+    found = Judge(dense, ViewProvider(dense, views)).quality(small)
     whole = DenseReference(dense, views)
     assert (found.psnr, found.worst) == whole.psnr(small)
     assert found.ssim == pytest.approx(
@@ -44,7 +44,7 @@ def test_the_figures_are_those_of_whole_pictures_over_covered_pixels(dense):
 def test_few_pixels_of_large_pictures_stand_for_all(dense):
     small = dense[::3]
     views = sample_views(dense, 4, 960, 720)
-    found = Judge(dense, ViewSource(dense, views)).quality(small)
+    found = Judge(dense, ViewProvider(dense, views)).quality(small)
     whole = DenseReference(dense, views)
     assert found.psnr == pytest.approx(whole.psnr(small)[0], abs=0.1)
     assert found.ssim == pytest.approx(
@@ -54,7 +54,7 @@ def test_few_pixels_of_large_pictures_stand_for_all(dense):
 
 
 def test_a_file_that_loses_is_judged_as_it_is_read(dense, tmp_path):
-    source = ViewSource(dense, sample_views(dense, 2, 64, 48))
+    source = ViewProvider(dense, sample_views(dense, 2, 64, 48))
     save(dense, tmp_path / "same.splat")
     read = through_file(dense, ".splat")[1]
     wanted = Judge(dense, source).quality(read)
@@ -91,4 +91,6 @@ def test_photos_lead_where_they_were_trained_on():
 
 def test_where_nothing_is_visible_nothing_is_judged(dense):
     unseen = dense.replace(opacities=dense.opacities - 100)
-    assert quality_of_file(judge_of(unseen, ViewSource(unseen)), unseen, Path("unseen.ply")) is None
+    assert (
+        quality_of_file(judge_of(unseen, ViewProvider(unseen)), unseen, Path("unseen.ply")) is None
+    )

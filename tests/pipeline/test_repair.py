@@ -8,8 +8,8 @@ import sys
 import pytest
 import torch
 
-import pointsplat_ns.pipeline.options as requests
 import pointsplat_ns.pipeline.repair as repair_module
+import pointsplat_ns.pipeline.repair_budget as repair_budget
 from making import FewViews, ball, same
 from pointsplat_ns.api import example_room
 from pointsplat_ns.errors import PointSplatError
@@ -23,9 +23,10 @@ from pointsplat_ns.pipeline.optimiser import (
     optimised,
 )
 from pointsplat_ns.pipeline.photos.examples import Example
-from pointsplat_ns.pipeline.repair import STEPS, RepairBudget, repair
+from pointsplat_ns.pipeline.repair import repair
+from pointsplat_ns.pipeline.repair_budget import STEPS, RepairBudget
 from pointsplat_ns.pipeline.repair_state import Unfinished
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rendering import render
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
@@ -76,7 +77,7 @@ def test_repairs_of_many_gaussians_take_more_steps_views_and_pixels_at_lower_rat
     hollow_ball, pruned, monkeypatch
 ):
     monkeypatch.setitem(STEPS, "quick", 4)
-    monkeypatch.setattr(requests, "FEW", 75)
+    monkeypatch.setattr(repair_budget, "FEW", 75)
     asked = []
 
     class Counted(FewViews):
@@ -88,7 +89,7 @@ def test_repairs_of_many_gaussians_take_more_steps_views_and_pixels_at_lower_rat
         pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None
     )
     assert repaired.steps == 8 and asked == [(2 * VIEW_COUNTS.stepped, 453)]
-    monkeypatch.setattr(requests, "FEW", 1e-9)
+    monkeypatch.setattr(repair_budget, "FEW", 1e-9)
     still = repair(
         pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None
     ).scene
@@ -104,7 +105,7 @@ def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
     with changed(USUAL):
         pruned = prune(room, 0.1, "merge")
         reference = DenseReference(room, sample_views(room, 4, 160, 120, seed=99))
-        source = ViewSource(room, given=sample_views(room, 20, 160, 120, seed=98))
+        source = ViewProvider(room, given=sample_views(room, 20, 160, 120, seed=98))
     learned, plain = (
         repair(pruned, room, source, RepairBudget("quick"), network=network).scene
         for network in ("shipped", None)
@@ -182,7 +183,7 @@ def test_a_budget_that_means_nothing_is_refused(budget):
 
 def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
     many = sample_views(hollow_ball, 40, 48, 36)
-    source = ViewSource(hollow_ball, given=many)
+    source = ViewProvider(hollow_ball, given=many)
     compared = {place(m) for m in source.compared().viewmats}
     first, second = (
         [place(view.viewmat) for view in itertools.islice(source.others(seed), 56)]
@@ -196,7 +197,7 @@ def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
 
 
 def test_steps_draw_few_pixels_of_each_view_as_of_several_sizes(hollow_ball):
-    source = ViewSource(hollow_ball, given=sample_views(hollow_ball, 40, 640, 480))
+    source = ViewProvider(hollow_ball, given=sample_views(hollow_ball, 40, 640, 480))
     taken = list(itertools.islice(source.others(), 84))
     assert {(view.width, view.height) for view in taken} == {(320, 240)}
     widened: dict[tuple[float, ...], set[float]] = {}
@@ -208,7 +209,7 @@ def test_steps_draw_few_pixels_of_each_view_as_of_several_sizes(hollow_ball):
 
 def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_ball):
     given = sample_views(hollow_ball, 20, 48, 36)
-    source = ViewSource(hollow_ball, given=given)
+    source = ViewProvider(hollow_ball, given=given)
     compared = {place(m) for m in source.compared().viewmats}
     left = {place(m) for m in given.viewmats} - compared
     taken = [place(view.viewmat) for view in itertools.islice(source.others(), 32)]

@@ -45,8 +45,8 @@ def outcome(words: list[str]) -> dict:
 
 if __name__ == "__main__":
     sys.addaudithook(no_network)
-    from pointsplat_ns.pipeline import view_provider as view_source
+    from pointsplat_ns.pipeline import view_provider
 
-    view_source.RESOLUTION = (64, 48)
+    view_provider.RESOLUTION = (64, 48)
     with changed(QUICK):
         print(json.dumps([outcome(words) for words in json.load(sys.stdin)]))

@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 import torch
 
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.threads import fixed_threads
@@ -356,7 +356,7 @@ def decoded(path: Path) -> list[np.ndarray]:
     return [frame.to_ndarray() for frame in frames]
 
 
-class FewViews(ViewSource):
+class FewViews(ViewProvider):
     """Fresh views of 48 x 36 pixels."""
 
     def sampled(self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = 320):

@@ -9,7 +9,7 @@ from foreign import write_sog_folder
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.view_sampling.upright import up_named
@@ -71,7 +71,7 @@ def test_up_is_named_or_estimated_and_fill_is_that_of_the_views():
     named = ps.info(scene, up="-y", **view)
     assert found.up_text.startswith("z") and found.up == [0, 0, 1]
     assert named.up_text == "-y" and not named.up_is_guess
-    views = ViewSource(scene, resolution=(64, 48), up=up_named("-y")).views(12)
+    views = ViewProvider(scene, resolution=(64, 48), up=up_named("-y")).views(12)
     assert named.fill == pytest.approx(fill(scene, views)) and named.fill != pytest.approx(
         found.fill
     )

@@ -1,18 +1,15 @@
 """Traces of photos, and where views come from."""
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
 
 from making import EYES, ball, normal_scene, photographed, run_of
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import Origin, ViewOrigin, ViewProvider
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.sampler import sample_views
 from pointsplat_ns.view_sampling.settings import LOOKING
 from pointsplat_ns.view_sampling.traces import PhotoTraces, correlation, trace_factors
@@ -149,38 +146,38 @@ def scene() -> Gaussians:
 def test_given_views_go_before_a_datasets_and_those_before_sampled_ones(scene, trained_walls):
     run = run_of(trained_walls, "wall-b")
     given = sample_views(scene, 3, 48, 36)
-    of_run = ViewSource(scene, run=run, dataset_views=dataset_views)
+    of_run = ViewProvider(scene, run=run)
     known = of_run.known(4)
     views = of_run.views(4)
-    assert len(known) == len(views) == 4 and of_run.origin == "poses of the dataset"
+    assert len(known) == len(views) == 4 and of_run.origin == ViewOrigin(Origin.DATASET)
     assert (views.width, views.height, views.rasterize_mode) == (64, 48, "antialiased")
     assert views.background.tolist() == [1.0, 1.0, 1.0]
-    source = ViewSource(scene, given, run, data_is_gone)
-    assert source.views(9) is given and len(source.known(2)) == 2 and source.origin == "given views"
-    gone = ViewSource(scene, run=run, dataset_views=data_is_gone)
-    assert len(gone.views(2)) == 2
+    source = ViewProvider(scene, given, run)
     assert (
-        gone.origin == f"sampled poses, up is {gone.sampler.up} (no dataset: its data is not there)"
+        source.views(9) is given
+        and len(source.known(2)) == 2
+        and source.origin == ViewOrigin(Origin.GIVEN)
     )
-    assert ViewSource(scene, run="scene.ply", dataset_views=dataset_views).known(4) is None
-    assert ViewSource(scene, given=given[:0]).known(3) is None
+    gone = ViewProvider(scene, run=run, data="nowhere")
+    assert len(gone.views(2)) == 2
+    assert gone.origin is not None
+    assert (gone.origin.kind, gone.origin.up) == (Origin.SAMPLED, gone.sampler.up)
+    assert "nowhere" in gone.origin.missing
+    assert ViewProvider(scene, run="scene.ply").known(4) is None
+    assert ViewProvider(scene, given=given[:0]).known(3) is None
     with pytest.raises(DataError, match="the views given are empty"):
-        ViewSource(scene, given[:0]).views(3)
-
-
-def data_is_gone(path: Path | str) -> Views:
-    raise SceneError("its data is not there")
+        ViewProvider(scene, given[:0]).views(3)
 
 
 def test_a_resolution_is_that_of_sampled_views_and_bounds_given_ones(scene):
-    asked = ViewSource(scene, resolution=(96, 54)).views(2)
+    asked = ViewProvider(scene, resolution=(96, 54)).views(2)
     assert (asked.width, asked.height) == (96, 54)
     given = sample_views(scene, 2, 90, 60)
-    assert ViewSource(scene, given=given, resolution=(30, 20)).views(2).width == 30
-    assert next(ViewSource(scene, given=given, resolution=(30, 20)).others()).width == 30
+    assert ViewProvider(scene, given=given, resolution=(30, 20)).views(2).width == 30
+    assert next(ViewProvider(scene, given=given, resolution=(30, 20)).others()).width == 30
 
 
 def test_a_scene_without_known_views_is_repaired_on_two_backgrounds(scene):
-    views = ViewSource(scene, resolution=(64, 48)).others()
+    views = ViewProvider(scene, resolution=(64, 48)).others()
     behind = [next(views).background.tolist() for _ in range(10)]
     assert behind.count([1.0, 1.0, 1.0]) == 2 and behind.count([0.0, 0.0, 0.0]) == 8

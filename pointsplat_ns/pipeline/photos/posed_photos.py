@@ -23,6 +23,7 @@ from pointsplat_ns.pipeline.photos.examples import Example, Photos, mean_psnr
 from pointsplat_ns.pipeline.photos.frame import in_frame
 from pointsplat_ns.pipeline.photos.pose_check import POSE_CHECK, likeness
 from pointsplat_ns.pipeline.photos.posed_scene import without_poses
+from pointsplat_ns.pipeline.report import HeldOut
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.scene.camera_files import (
     NamedViews,
@@ -160,16 +161,16 @@ def read_with_photos(
     )
 
 
-def held_out_text(dense: Gaussians, results: Sequence[Gaussians], photos: Photos) -> str:
-    """Text on the PSNR of results in held-out photos, one after the other, and of the dense scene,
-    which is on the device that renders."""
+def held_out_psnrs(
+    dense: Gaussians, results: Sequence[Gaussians], photos: Photos
+) -> HeldOut | None:
+    """PSNR of results in held-out photos, and of the dense scene, which is on the device that
+    renders; None if there are no photos."""
+    if not photos:
+        return None
     shown = spread_indices(len(photos), VIEW_COUNTS.compared)
     *psnrs, best = (mean_psnr(scene.to(dense.device), photos, shown) for scene in (*results, dense))
-    figures = " -> ".join(f"{psnr:.1f}" for psnr in psnrs)
-    return (
-        f"held-out photos: {figures} dB PSNR in {len(shown)} photos, of the dense scene "
-        f"{best:.1f} dB"
-    )
+    return HeldOut(photos=len(shown), psnrs=tuple(psnrs), dense=best)
 
 
 def _usable(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.pipeline.options import NO_POSES
 from pointsplat_ns.pipeline.photos.pose_check import POSE_CHECK, Photo, likeness, pose_faults
 from pointsplat_ns.scene.camera_files import (
     NamedViews,
@@ -21,9 +22,6 @@ from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.scene.runs import RUN_FILES, may_be_run
 from pointsplat_ns.scene.views import Views, spread_indices
 from pointsplat_ns.system.files import logger
-
-NO_POSES = "none"
-"""In place of a file of cameras: views are sampled, whatever lies beside the scene."""
 
 
 def without_poses(poses: object) -> bool:

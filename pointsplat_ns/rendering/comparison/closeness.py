@@ -33,13 +33,6 @@ class Closeness:
     """Width of the pictures, pixels; None if it is not known."""
 
     @property
-    def where(self) -> str:
-        """Text: the number of views, and their width."""
-        return views_text(len(self.errors)) + (
-            "" if self.width is None else f" of {self.width} pixels"
-        )
-
-    @property
     def psnr(self) -> float:
         """PSNR over the pixels that the dense scene covers in all views, dB; inf if nothing
         differs."""
@@ -137,8 +130,3 @@ class DenseReference(Reference):
 def _drawn(scene: Gaussians, views: Views) -> Iterator[tuple[Tensor, Tensor]]:
     """Image (H, W, 3) and alpha (H, W, 1) of each view."""
     return each_view(scene, views, render_with_alpha)
-
-
-def views_text(count: int) -> str:
-    """A number of views in words: "1 view", "3 views"."""
-    return f"{count} view{'s' if count != 1 else ''}"

@@ -8,7 +8,6 @@ the next coarser level. A repair moves the Gaussians of a level, and keeps their
 from __future__ import annotations
 
 import functools
-import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +20,13 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.pipeline.acceptance import Comparison
-from pointsplat_ns.pipeline.compact import repaired_stage
-from pointsplat_ns.pipeline.options import PruneRequest, RepairBudget, default_device
+from pointsplat_ns.pipeline.options import ReductionOptions, default_device
 from pointsplat_ns.pipeline.prune import prune_scene
 from pointsplat_ns.pipeline.quality import Judge, Quality
-from pointsplat_ns.pipeline.report import Stage, stage_text
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.repair_budget import RepairBudget
+from pointsplat_ns.pipeline.report import StageResult
+from pointsplat_ns.pipeline.stages import Context, Repair
+from pointsplat_ns.pipeline.view_provider import ViewOrigin, ViewProvider
 from pointsplat_ns.pruning import Keep, found_by_trying, need_usable, parse_keep, resolve_keep
 from pointsplat_ns.pruning.merging import merge_levels
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
@@ -43,6 +43,7 @@ from pointsplat_ns.tools.levels.folder import check_folder, level_names, write_l
 from pointsplat_ns.tools.levels.paged import write_paged
 from pointsplat_ns.tools.levels.stream import write_stream
 from pointsplat_ns.tools.levels.tiles import TILESET, placed, write_tiles
+from pointsplat_ns.tools.wording import origin_text, quality_text, sh_text, stage_text
 from pointsplat_ns.view_sampling.content import content_box
 
 
@@ -62,7 +63,7 @@ class Level:
     """How close its renders are to the dense scene's; None if there is no view."""
     seconds: float
     """Duration of merging from the level before, and of the repair."""
-    repair: Stage | None = None
+    repair: StageResult | None = None
     """The repair of the level, kept or not; None if there was none."""
 
     def facts(self, whole: int) -> dict[str, Any]:
@@ -78,7 +79,7 @@ class Level:
             "psnr": near and near.psnr,
             "worst_psnr": near and near.worst,
             "ssim": near and near.ssim,
-            "quality": near and str(near),
+            "quality": near and quality_text(near),
         }
 
 
@@ -103,8 +104,8 @@ class Levels:
     """The finest first."""
     views: Views | None
     """The views that tell from which distance on a level shows enough; None if there are none."""
-    origin: str
-    """Origin of the views."""
+    origin: ViewOrigin | None
+    """Where the views came from."""
     source: SourceFile | None
     """The file of the dense scene; None if it was given as Gaussians."""
     notes: tuple[str, ...]
@@ -165,7 +166,7 @@ class Levels:
         if of is not None:
             views = {
                 "count": len(of),
-                "origin": self.origin,
+                "origin": origin_text(self.origin),
                 "width": of.width,
                 "height": of.height,
             }
@@ -318,8 +319,8 @@ def level_counts(
 def make_levels(
     dense: Gaussians,
     levels: list[tuple[str, Keep]],
-    request: PruneRequest,
-    views: ViewSource,
+    options: ReductionOptions,
+    views: ViewProvider,
     source: SourceFile | None,
     progress: Progress,
     budget: RepairBudget,
@@ -329,7 +330,7 @@ def make_levels(
     Args:
         dense: N Gaussians. Undrawable ones are left out first, and their number is logged.
         levels: of :func:`parse_levels`; in any order.
-        request: for all Gaussians; its SH bands are those of every level.
+        options: for all Gaussians; their SH bands are those of every level.
         views: source of the views to compare renders in; merging uses them too where they are
             known.
         source: the file of ``dense``, for the manifest.
@@ -346,9 +347,9 @@ def make_levels(
     need_usable(dense)
     dense = keep_usable(dense, "the dense scene")
     progress("rendering the dense scene", 0.0)
-    cut = prune_scene(dense, request, views)
+    cut = prune_scene(dense, options, views)
     counts = level_counts(levels, len(dense), cut.scene.sh_degree, dense.traits)
-    notes = cut.notes
+    notes: tuple[str, ...] = () if cut.sh is None else (sh_text(cut.sh),)
     compared = None
     judge = None
     try:
@@ -356,13 +357,12 @@ def make_levels(
         compared = views.compared()
     except DataError as error:
         notes = (*notes, f"the levels' errors are not measured: {error}")
-    if views.origin and views.text not in notes:
-        notes = (views.text, *notes)
-    comparison = None
-    at_work = dense
-    if judge is not None and not budget.empty:
-        at_work = dense.to(default_device())
-        comparison = Comparison(at_work, views)
+    if views.origin is not None:
+        notes = (f"views: {origin_text(views.origin)}", *notes)
+    repair = Repair(budget)
+    repairing = judge is not None and not budget.empty
+    at_work = dense.to(default_device()) if repairing else dense
+    comparison = Comparison(at_work, views) if repairing else None
     made: list[Level] = []
     start = time.perf_counter()
     for merged in merge_levels(
@@ -370,20 +370,20 @@ def make_levels(
     ):
         which = f"level {len(made)}"
         scene = merged.scene
-        repair = None
+        repaired = None
         if comparison is not None and len(scene) < len(cut.scene):
             before = comparison.reference.closeness(scene.to(at_work.device))
-            if before.psnr < math.inf:
-                report = within(which, progress)
-                merge = Stage("merge", scene, before)
-                repair = repaired_stage(merge, at_work, budget, comparison, views, report)
-                scene = repair.scene if repair.accepted else scene
-                notes = (*notes, f"{which}: {stage_text(repair)}")
-                comparison = None if repair.interrupted else comparison
+            merge = StageResult("merge", scene, before)
+            if repair.applies(merge):
+                context = Context(at_work, views, comparison, progress=within(which, progress))
+                repaired = repair.run(merge, context)
+                scene = repaired.scene if repaired.accepted else scene
+                notes = (*notes, f"{which}: {stage_text(repaired)}")
+                comparison = None if repaired.interrupted else comparison
         seconds = time.perf_counter() - start
         progress(f"judging {which} of {len(counts) - 1}", 0.0)
         quality = None if judge is None else judge.quality(scene)
         dropped = int((merged.assignment < 0).sum())
-        made.append(Level(scene, merged.assignment, dropped, quality, seconds, repair))
+        made.append(Level(scene, merged.assignment, dropped, quality, seconds, repaired))
         start = time.perf_counter()
     return Levels(dense, tuple(made), compared, views.origin, source, notes, judge)

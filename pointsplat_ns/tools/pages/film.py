@@ -12,11 +12,12 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.tools.pages.image_encoding import to_uint8, with_labels
+from pointsplat_ns.tools.wording import missing_text, origin_text
 from pointsplat_ns.view_sampling.opening_views import opening_views
 from pointsplat_ns.view_sampling.poses import look_at
 from pointsplat_ns.view_sampling.upright import Up, known_up
@@ -58,7 +59,7 @@ class FilmSettings:
 
 def camera_path(
     scene: Gaussians,
-    source: ViewSource,
+    source: ViewProvider,
     settings: FilmSettings,
     one: bool = False,
     up: Up | None = None,
@@ -91,7 +92,7 @@ def camera_path(
         )
         origin = (
             f"{'around' if opening.whole else 'past'} what shows most, up is "
-            f"{opening.up}{source.missing}"
+            f"{opening.up}{missing_text(source.missing)}"
         )
         return along(stops, frames, opening.up.direction), origin
     if settings.seconds is None and not one:
@@ -105,7 +106,7 @@ def camera_path(
     if one:
         known = opening_views(scene, up=up, known=known.spread(4 * VIEW_COUNTS.walked)).views
     known = fitted(known, *settings.shape(usual.width, usual.height))
-    return along(known, frames), f"along the {source.origin}{skipped}"
+    return along(known, frames), f"along the {origin_text(source.origin)}{skipped}"
 
 
 def along(views: Views, frames: int, up: Tensor | None = None) -> Views:

@@ -11,7 +11,7 @@ from pathlib import Path
 from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import need_usable, resolve_keep, select
 from pointsplat_ns.pruning.baselines import coverage_score
 from pointsplat_ns.pruning.merging import Merger
@@ -53,7 +53,7 @@ class ViewedScene:
         name: str,
         path: Path | None,
         scene: Gaussians,
-        source: ViewSource,
+        source: ViewProvider,
         there: Sequence[Gaussians] = (),
     ):
         need_usable(scene)

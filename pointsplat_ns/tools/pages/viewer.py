@@ -24,6 +24,7 @@ from pointsplat_ns.tools.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.tools.pages.html import page
 from pointsplat_ns.tools.pages.server import Answer, Request, Route, Server
 from pointsplat_ns.tools.pages.slider_scenes import Level, ViewedScene
+from pointsplat_ns.tools.wording import missing_text, origin_text
 from pointsplat_ns.view_sampling.upright import Up
 
 READABLE_NAMES = (
@@ -47,8 +48,10 @@ class _Stage:
         self.frame = FlightFrame.of(
             first.scene, known, first.source.sampler.up if up is None and known is None else up
         )
-        found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
-        self.origin = found if known is None else first.source.origin
+        found = (
+            f"the view that shows most, up is {self.frame.up}{missing_text(first.source.missing)}"
+        )
+        self.origin = found if known is None else origin_text(first.source.origin)
         shown = [{"name": viewed.name, "amount": ""} for viewed in scenes]
         if len(scenes) == 1:
             shown.append({"name": "all of it", "amount": ""})

@@ -11,8 +11,7 @@ from typing import Any
 import torch
 
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
-from pointsplat_ns.pipeline.quality import decibels, word_for
+from pointsplat_ns.pipeline.options import ViewOptions
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
 from pointsplat_ns.rendering import render
@@ -37,6 +36,7 @@ from pointsplat_ns.tools.tradeoff.points import (
 )
 from pointsplat_ns.tools.tradeoff.recommend import next_best, recommend
 from pointsplat_ns.tools.tradeoff.subject import make, subject_at
+from pointsplat_ns.tools.wording import decibels, impression, views_of_size
 
 
 @normal_mode
@@ -104,8 +104,6 @@ def measure_tradeoff(
     check_options(keep, by, repairs, within, views)
     path = Path(scene)
     folder = Path(folder)
-    need_named_data(path, data)
-    need_folder(folder)
     with progress_bar(progress) as report:
         if (folder / RESULTS["json"]).exists() and not force:
             raise SceneError(
@@ -113,7 +111,9 @@ def measure_tradeoff(
             )
         report("looking for views", 0.0)
         own = None if photos is None else Path(photos)
-        subject = subject_at(path, poses, resolution, up, data, own, report, "photos" in repairs)
+        options = ViewOptions(poses=poses, resolution=resolution, up=up, data=data)
+        subject = subject_at(path, options, own, report, "photos" in repairs)
+        need_folder(folder)
         table = settings_of(subject.dense, keep, by, repairs)
         measuring = _Measuring(Measurer(subject, views), within, folder)
         try:
@@ -201,7 +201,7 @@ class _Measuring:
             scene=name_of(measurer.subject.path),
             machine=machine_text(measurer.dense.device),
             views_origin=measurer.judged.origin,
-            judged_in=measurer.judge.where,
+            judged_in=views_of_size(measurer.judge.views),
             width=measurer.judged.views.width,
             height=measurer.judged.views.height,
             points=tuple(self.points),
@@ -232,7 +232,7 @@ def write_page(found: Tradeoff, pictures: Sequence[dict[str, str]], output: Path
         found=found,
         photos=dense.against_photos is not None,
         shown=shown,
-        word_for=word_for,
+        word_for=impression,
         three_digits=three_digits,
         infinity=math.inf,
         data=data,

@@ -34,6 +34,7 @@ from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.threads import most_threads, now
 from pointsplat_ns.tools.tradeoff.points import DENSE, ImageMetrics, Point, Setting, Speed
 from pointsplat_ns.tools.tradeoff.subject import Subject
+from pointsplat_ns.tools.wording import origin_text
 
 ROUNDS = 3
 """Number of timed frames of each view, alternating between the dense scene and the measured
@@ -69,7 +70,7 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
             note = f"there are no held-out photos: {error}"
     source = subject.new_views()
     return JudgedViews(
-        source.compared().spread(min(count, VIEW_COUNTS.compared)), None, source.origin
+        source.compared().spread(min(count, VIEW_COUNTS.compared)), None, origin_text(source.origin)
     ), note
 
 

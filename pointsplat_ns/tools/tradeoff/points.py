@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
-from pointsplat_ns.pipeline.repair import Effort
+from pointsplat_ns.pipeline.repair_budget import Effort
 from pointsplat_ns.system.files import write_json
 
 Repair = Literal["none", "quick", "thorough", "photos"]

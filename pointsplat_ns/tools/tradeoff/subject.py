@@ -10,25 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos, view_source
 from pointsplat_ns.pipeline.compact import compact_scene
-from pointsplat_ns.pipeline.options import CompactRequest, PruneRequest, RepairBudget
+from pointsplat_ns.pipeline.options import NO_POSES, CompactOptions, PruneOptions, ViewOptions
 from pointsplat_ns.pipeline.photos.examples import Photos
-from pointsplat_ns.pipeline.photos.posed_photos import read_with_photos
-from pointsplat_ns.pipeline.photos.posed_scene import (
-    NO_POSES,
-    check_photos,
-    read_found,
-    without_poses,
-)
 from pointsplat_ns.pipeline.prune import prune_scene
-from pointsplat_ns.pipeline.view_provider import ViewSource
-from pointsplat_ns.rendering.comparison.sizes import parse_resolution, size_text
+from pointsplat_ns.pipeline.run_data import run_data
+from pointsplat_ns.pipeline.subject import read_subject
+from pointsplat_ns.pipeline.view_provider import ViewProvider
+from pointsplat_ns.rendering.comparison.sizes import size_text
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import may_be_run, name_of
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tools.tradeoff.points import DENSE, EFFORTS, Setting
-from pointsplat_ns.view_sampling.upright import up_named
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +30,7 @@ class Subject:
 
     dense: Gaussians
     path: Path
-    new_views: Callable[[], ViewSource]
+    new_views: Callable[[], ViewProvider]
     """Makes a new source of its views, the same as for its commands."""
     held_out: Callable[[], Photos] | None = None
     """Reads its held-out photos; None if it cannot have any."""
@@ -89,10 +82,7 @@ class Subject:
 
 def subject_at(
     path: Path,
-    poses: str | Path | None,
-    resolution: tuple[int, int] | str | None,
-    up: str | None,
-    data: str | Path | None,
+    options: ViewOptions,
     photos: Path | None,
     progress: Progress,
     training: bool,
@@ -100,29 +90,18 @@ def subject_at(
     """The scene at a path, with the options on views that its commands repeat; ``photos`` is a
     folder of photos. With ``training``, photos are also trained on. Raises a PointSplatError if
     there are none."""
-    size = parse_resolution(resolution)
-    upward = up_named(up)
-    sampled = without_poses(poses)
+    options.check()
+    asked: Path | bool = training if photos is None else photos
+    read = read_subject(path, options, photos=asked, training=training, progress=progress)
     held_out: Callable[[], Photos] | None = None
-    trained: Photos | None = None
-    run = None if sampled or photos is not None else path
-    if photos is None:
-        dense, given, file = read_found(path, poses)
-        if run is not None and given is None and may_be_run(run):
-            held_out = functools.partial(run_photos, run, "test", data)
-        if training:
-            trained = run_photos(path, "train", data)
-            check_photos(dense, trained, str(path))
-    else:
-        dense, posed = read_with_photos(path, photos, poses, data, size, progress, training)
-        given = posed.views
-        file = posed.poses
-        trained = posed.training
-        held_out = lambda: posed.held_out  # noqa: E731
+    if photos is not None:
+        held_out = lambda: read.held_out  # noqa: E731
+    elif not options.sampled and read.given is None and may_be_run(path):
+        held_out = functools.partial(run_data().photos, path, "test", options.data)
     named = {
-        "--poses": NO_POSES if sampled else file,
-        "--resolution": None if size is None else size_text(size),
-        "--data": data,
+        "--poses": NO_POSES if options.sampled else read.poses,
+        "--resolution": None if options.size is None else size_text(options.size),
+        "--data": options.data,
     }
     words = [
         word
@@ -130,9 +109,17 @@ def subject_at(
         if value is not None
         for word in (option, str(value))
     ]
-    words += [] if up is None else [f"--up={up}"]
-    new_views = functools.partial(view_source, dense, given, run, data, size, upward)
-    return Subject(dense, path, new_views, held_out, trained, tuple(words), size, photos)
+    words += [] if options.up is None else [f"--up={options.up}"]
+    return Subject(
+        dense=read.dense,
+        path=path,
+        new_views=read.views,
+        held_out=held_out,
+        training=read.training,
+        words=tuple(words),
+        resolution=options.size,
+        photos=photos,
+    )
 
 
 def make(subject: Subject, setting: Setting, progress: Progress) -> tuple[Gaussians, float]:
@@ -143,13 +130,16 @@ def make(subject: Subject, setting: Setting, progress: Progress) -> tuple[Gaussi
     views = subject.new_views()
     start = time.perf_counter()
     if setting.repair == "none":
-        scene = prune_scene(dense, PruneRequest(setting.count, setting.by), views, progress).scene
+        options = PruneOptions(keep=setting.count, by=setting.by)
+        scene = prune_scene(dense, options, views, progress).scene
     else:
-        budget = RepairBudget(EFFORTS[setting.repair])
-        request = CompactRequest.of(
-            None, setting.count, setting.by, repair=budget, photos=setting.repair == "photos"
-        )
-        compacted = compact_scene(dense, request, views, progress, subject.training)
+        asked = CompactOptions(
+            keep=setting.count,
+            by=setting.by,
+            effort=EFFORTS[setting.repair],
+            photos=setting.repair == "photos",
+        ).completed()
+        compacted = compact_scene(dense, asked, views, progress, subject.training)
         if compacted.interrupted:
             raise KeyboardInterrupt
         scene = compacted.scene

@@ -11,8 +11,7 @@ from lab.tables import layout
 from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
 from making import box_room
-from pointsplat_ns.pipeline import repair
-from pointsplat_ns.pipeline import view_provider as view_source
+from pointsplat_ns.pipeline import repair, view_provider
 from pointsplat_ns.refinement import Refiner, preset
 from pointsplat_ns.refinement.weights import save_refiner
 
@@ -44,7 +43,7 @@ def room(tmp_path, views_of_room, no_lpips, monkeypatch) -> Path:
     """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps,
     figures are none."""
     monkeypatch.setattr(
-        view_source.Sampler, "views", lambda sampler, count, *_, **options: views_of_room[:count]
+        view_provider.Sampler, "views", lambda sampler, count, *_, **options: views_of_room[:count]
     )
     monkeypatch.setattr(
         layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure")

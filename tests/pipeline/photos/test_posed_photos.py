@@ -15,9 +15,9 @@ from making import ball, views_from_within
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
-from pointsplat_ns.pipeline.options import PHOTO_STEPS
 from pointsplat_ns.pipeline.photos import frame as module
 from pointsplat_ns.pipeline.photos.posed_photos import PosedPhotos, read_with_photos
+from pointsplat_ns.pipeline.repair_budget import PHOTO_STEPS
 from pointsplat_ns.scene.image_files import write_picture
 from pointsplat_ns.scene.rotation import Similarity
 from pointsplat_ns.view_sampling.poses import look_at, views_of

@@ -11,7 +11,8 @@ import pointsplat_ns as ps
 from making import run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.pipeline.requests import Looking, read_source
+from pointsplat_ns.pipeline.options import ViewOptions
+from pointsplat_ns.pipeline.subject import read_subject
 from posing import inria, nerfstudio, write_photos, write_sparse
 
 
@@ -21,7 +22,7 @@ def views(scene) -> ps.Views:
 
 
 def known(path: Path, poses: str | None = None) -> ps.Views | None:
-    return read_source(path, Looking(poses))[1].given
+    return read_subject(path, ViewOptions(poses=poses)).given
 
 
 def same(found: ps.Views | None, views: ps.Views) -> bool:
@@ -87,5 +88,5 @@ def test_damaged_files_beside_a_scene_stop_nothing(scene, tmp_path, said):
 
 def test_none_passes_over_the_dataset_of_a_run_too(trained_walls):
     run = run_of(trained_walls, "wall-a")
-    assert read_source(run, Looking())[1].known(3) is not None
-    assert read_source(run, Looking("none"))[1].known(3) is None
+    assert read_subject(run, ViewOptions()).views().known(3) is not None
+    assert read_subject(run, ViewOptions(poses="none")).views().known(3) is None

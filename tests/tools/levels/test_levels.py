@@ -10,8 +10,8 @@ from refusing import refusal, run
 
 import pointsplat_ns as ps
 from making import ball, same
-from pointsplat_ns.pipeline.options import STEPS
 from pointsplat_ns.pipeline.quality import Judge
+from pointsplat_ns.pipeline.repair_budget import STEPS
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats.sog_stream import read_sog_stream
 from pointsplat_ns.tools.levels import folder as level_folder

@@ -9,7 +9,7 @@ import torch
 import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.tools.pages import film
 from pointsplat_ns.tools.pages.film import FilmSettings, along, fitted, toured
 from pointsplat_ns.tools.pages.image_encoding import with_labels
@@ -83,7 +83,9 @@ def test_film_of_an_object_goes_once_around_it(monkeypatch):
     opening = Opening(ring(turn * torch.arange(12)), Up(up), whole=True)
     monkeypatch.setattr(film, "opening_views", lambda *_: opening)
     scene = ball(20)
-    path, _ = film.camera_path(scene, ViewSource(scene), FilmSettings(64, 48, fps=10, seconds=3.7))
+    path, _ = film.camera_path(
+        scene, ViewProvider(scene), FilmSettings(64, 48, fps=10, seconds=3.7)
+    )
     torch.testing.assert_close(path.viewmats[0], path.viewmats[-1], rtol=0, atol=1e-9)
     apart = axes(path, 3)[:-1] - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
     assert bool(((apart[:, :2].norm(dim=1) - 3).abs() < 0.15).all())

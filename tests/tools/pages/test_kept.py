@@ -9,7 +9,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.tools.pages import slider_scenes as module
 from pointsplat_ns.tools.pages.slider_scenes import ViewedScene
 
@@ -21,7 +21,7 @@ def scene() -> ps.Gaussians:
 
 @pytest.fixture()
 def levels(scene) -> Iterator[ViewedScene]:
-    made = ViewedScene("ball", None, scene, ViewSource(scene))
+    made = ViewedScene("ball", None, scene, ViewProvider(scene))
     yield made
     made.close(5.0)
 
@@ -90,6 +90,6 @@ def test_merged_levels_together_take_no_more_than_the_scene(levels, monkeypatch)
 
 def test_gaussians_that_cannot_be_drawn_are_left_out(scene):
     broken = scene.replace(means=scene.means.index_fill(0, torch.tensor([0, 7]), torch.nan))
-    made = ViewedScene("ball", None, broken, ViewSource(broken))
+    made = ViewedScene("ball", None, broken, ViewProvider(broken))
     made.close(5.0)
     assert len(made.scene) == 398

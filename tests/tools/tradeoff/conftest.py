@@ -7,8 +7,7 @@ import pytest
 
 import pointsplat_ns as ps
 from making import box_room
-from pointsplat_ns.pipeline import repair
-from pointsplat_ns.pipeline import view_provider as view_source
+from pointsplat_ns.pipeline import repair, view_provider
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.tools.tradeoff.points import Tradeoff
 from pointsplat_ns.view_sampling.sampler import sample_views
@@ -34,7 +33,7 @@ def measured(room, room_views, tmp_path, monkeypatch) -> Callable[..., Tradeoff]
     ``out``. Repairs take two steps."""
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     monkeypatch.setattr(
-        view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count]
+        view_provider.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count]
     )
 
     def measure(**options) -> Tradeoff:

@@ -16,11 +16,10 @@ import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.pipeline import compact, repair
-from pointsplat_ns.pipeline import view_provider as view_source
+from pointsplat_ns.pipeline import compact, repair, view_provider
 from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.pipeline.repair import Repaired
-from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tools.tradeoff import measure_table as table
 from pointsplat_ns.tools.tradeoff import measuring
@@ -147,7 +146,7 @@ def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(room, room
     mask = torch.arange(48) < 25
     photos = [Example(view, photo, mask.expand(36, -1)[..., None]) for view in room_views]
     turned = Example(replace(room_views[0], width=36, height=48), photo.transpose(0, 1))
-    subject = Subject(dense, room, lambda: ViewSource(dense), lambda: [turned, *photos[1:]])
+    subject = Subject(dense, room, lambda: ViewProvider(dense), lambda: [turned, *photos[1:]])
     (views, small, _), note = views_to_judge(replace(subject, resolution=(24, 18)), 3)
     assert (len(views), views.width, views.height) == (2, 24, 18) and note.startswith(
         "1 of 3 held-out photos"
@@ -163,7 +162,7 @@ def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(room, room
 
 def test_pictures_too_small_for_ssim_are_refused(measured, room_views, monkeypatch):
     views = replace(room_views, width=10)
-    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views)
+    monkeypatch.setattr(view_provider.Sampler, "views", lambda sampler, count, *_, **options: views)
     with pytest.raises(DataError, match="views are 10 x 36 pixels; expected at least 11 a side"):
         measured()
 
@@ -191,12 +190,12 @@ def test_a_command_makes_the_scene_that_was_measured(
     setting, room, room_views, tmp_path, monkeypatch
 ):
     monkeypatch.setitem(repair.STEPS, "quick", 2)
-    monkeypatch.setattr(view_source.Sampler, "views", lambda *args, **options: room_views)
+    monkeypatch.setattr(view_provider.Sampler, "views", lambda *args, **options: room_views)
     monkeypatch.chdir(tmp_path)
     path = Path("the room.ply")
     dense = ps.load(room)
     path.write_bytes(room.read_bytes())
-    subject = Subject(dense, path, lambda: ViewSource(dense))
+    subject = Subject(dense, path, lambda: ViewProvider(dense))
     (made, _) = make(subject, setting, lambda what, share: None)
     names = subject.names(setting)
     program, *words = shlex.split(names["command"])
