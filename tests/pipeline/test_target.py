@@ -17,6 +17,8 @@ from pointsplat_ns.pipeline.view_provider import ViewSource
 from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def dense() -> ps.Gaussians:

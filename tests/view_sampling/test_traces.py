@@ -14,7 +14,7 @@ from pointsplat_ns.pipeline.view_provider import ViewSource
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.sampler import sample_views
-from pointsplat_ns.view_sampling.settings import LOOKING
+from pointsplat_ns.view_sampling.settings import SHIPPED
 from pointsplat_ns.view_sampling.traces import PhotoTraces, correlation, trace_factors
 
 
@@ -122,7 +122,7 @@ def test_extremes_stay_within_bounds(dtype):
             scene.replace(features_rest=rest, scales=scales), torch.arange(2000)
         )
         assert bool(factors.isfinite().all())
-        assert float(factors.log().abs().max()) <= LOOKING.max_log_factor + 1e-5
+        assert float(factors.log().abs().max()) <= SHIPPED.max_log_factor + 1e-5
 
 
 def test_views_are_sampled_where_photos_were_taken():

@@ -14,6 +14,8 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.pipeline.requests import Looking, read_source
 from posing import inria, nerfstudio, write_photos, write_sparse
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def views(scene) -> ps.Views:

@@ -12,6 +12,7 @@ from pointsplat_ns.pipeline import view_provider as view_source
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.tools.tradeoff.points import Tradeoff
 from pointsplat_ns.view_sampling.sampler import sample_views
+from quick import quick_settings
 
 
 @pytest.fixture(scope="session")
@@ -25,7 +26,8 @@ def room(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def room_views(room) -> Views:
     """Three small views of it."""
-    return sample_views(ps.load(room), 3, 48, 36)
+    with quick_settings():
+        return sample_views(ps.load(room), 3, 48, 36)
 
 
 @pytest.fixture()
