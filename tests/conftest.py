@@ -17,6 +17,7 @@ from making import SHARED_DATA, ball, losses_of, small_config
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.sampler import sample_views
+from quick import quick_settings
 from replica_scenes import write_frames
 
 SEED = 20
@@ -196,7 +197,8 @@ def hollow_ball() -> Gaussians:
 @pytest.fixture(scope="session")
 def ball_views(hollow_ball: Gaussians) -> Views:
     """Four small views from within."""
-    return sample_views(hollow_ball, 4, 64, 48)
+    with quick_settings():
+        return sample_views(hollow_ball, 4, 64, 48)
 
 
 @pytest.fixture(scope="module")

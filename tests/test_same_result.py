@@ -12,6 +12,8 @@ from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.threads import fixed_threads
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def room():

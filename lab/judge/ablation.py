@@ -37,7 +37,7 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.system.files import replacing
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.view_sampling.settings import LOOKING, changed
+from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
 
 BASELINE = "default"
 """Name of the settings that all variants are compared with."""
@@ -126,15 +126,15 @@ def settings_of(views: int, width: int) -> dict[str, Any]:
     return (
         {"views": views, "width": width}
         | values
-        | {f"looking.{name}": v for name, v in vars(LOOKING).items()}
+        | {f"looking.{name}": v for name, v in vars(SHIPPED).items()}
     )
 
 
 @contextmanager
 def applied(changes: dict[str, Any]) -> Iterator[MergeSettings]:
     """Settings of merging with changes. Those of looking are changed while the context is open."""
-    looking = {name: value for name, value in changes.items() if name in vars(LOOKING)}
-    with changed(looking):
+    looking = {name: value for name, value in changes.items() if name in vars(SHIPPED)}
+    with use_settings(dataclasses.replace(SHIPPED, **looking)):
         yield dataclasses.replace(
             MERGING, **{name: v for name, v in changes.items() if name not in looking}
         )

@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from contextvars import copy_context
 from typing import TypeVar
 
 import torch
@@ -98,8 +99,8 @@ def in_turn(
 
     One operation on a small piece that stays in the cache is faster on one thread than shared
     between several, which wait for one another. Calls must not depend on each other. torch takes
-    gradients in them if it does here. No call runs any more when this ends, by an error or Ctrl-C,
-    too.
+    gradients in them if it does here, and context variables have the values that they have here.
+    No call runs any more when this ends, by an error or Ctrl-C, too.
     """
     count = min(most_threads(), len(items)) if device.type == "cpu" else 1
     if count <= 1:
@@ -113,7 +114,7 @@ def in_turn(
             return function(item)
 
     threads = pool("pieces", count, inside)
-    futures = deque(threads.submit(call, item) for item in items)
+    futures = deque(threads.submit(copy_context().run, call, item) for item in items)
     try:
         while futures:
             result = futures[0].result()

@@ -44,7 +44,7 @@ from pointsplat_ns.view_sampling.content import (
     thinning,
 )
 from pointsplat_ns.view_sampling.poses import level_directions, look_at, views_of
-from pointsplat_ns.view_sampling.settings import LOOKING
+from pointsplat_ns.view_sampling.settings import looking
 from pointsplat_ns.view_sampling.traces import PhotoTraces, log_widths, means_around
 from pointsplat_ns.view_sampling.upright import Surface, Up, known_up, upright
 
@@ -127,10 +127,10 @@ class Sampler:
                 f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least "
                 "1 x 1"
             )
-        self.scene = thinned(scene.detach(), LOOKING.sampled_count).to(
+        self.scene = thinned(scene.detach(), looking().sampled_count).to(
             "cpu"
         )  # many small operations
-        self._step = stands_for * thinning(len(scene), LOOKING.sampled_count)
+        self._step = stands_for * thinning(len(scene), looking().sampled_count)
         self.resolution = resolution
         self._up = known_up(up, scene)
 
@@ -173,20 +173,20 @@ class Sampler:
     @cached_property
     def few(self) -> Gaussians:
         """Some of the Gaussians, enlarged to cover as much as all, each beside its neighbours."""
-        few = thinned(self._in_units, LOOKING.candidate_gaussians)
+        few = thinned(self._in_units, looking().candidate_gaussians)
         return few[curve_keys(unit_cells(few.means)).argsort(stable=True)]
 
     @cached_property
     def _log_widths(self) -> Tensor:
         """Logarithms (n,) of the widths of :attr:`few` before they were enlarged, float64."""
-        step = self._step * thinning(len(self._in_units), LOOKING.candidate_gaussians)
+        step = self._step * thinning(len(self._in_units), looking().candidate_gaussians)
         return log_widths(self.few.scales) - 0.5 * math.log(step)
 
     @cached_property
     def _targets(self) -> Tensor:
         """Indices (t,) of those of :attr:`few` that are opaque enough to be looked at."""
         alphas = self.few.alphas
-        return (alphas > min(LOOKING.min_opacity, 0.5 * float(alphas.max()))).nonzero()[:, 0]
+        return (alphas > min(looking().min_opacity, 0.5 * float(alphas.max()))).nonzero()[:, 0]
 
     @cached_property
     def _floor(self) -> float:
@@ -207,7 +207,7 @@ class Sampler:
             raise DataError(f"{count} views asked for; expected at least 1")
         generator = torch.Generator().manual_seed(seed)
         drawn = self._drawn(
-            max(LOOKING.min_candidates, LOOKING.candidates_per_view * count), generator
+            max(looking().min_candidates, looking().candidates_per_view * count), generator
         )
         candidates = views_of(drawn, *self.resolution, UNITS)
         likelihoods, shown = self.judged(candidates)
@@ -223,7 +223,7 @@ class Sampler:
         float64, and which of the Gaussians :attr:`few` each shows (V, n), bool."""
         viewmats = views.viewmats.double()
         eyes = invert_rigid(viewmats)[:, :3, 3]
-        small = replace(views.resized(LOOKING.candidate_side), rasterize_mode="antialiased")
+        small = replace(views.resized(looking().candidate_side), rasterize_mode="antialiased")
         widths = self._log_widths.exp().float()
 
         def look(index: int) -> tuple[float, Tensor]:
@@ -255,7 +255,7 @@ class Sampler:
         coverage = torch.zeros_like(shown[0])
         taken: list[int] = []
         for _ in range(min(count, len(likely))):
-            gains = likely * (shown @ (1 / (LOOKING.half_gain_coverage + coverage)))
+            gains = likely * (shown @ (1 / (looking().half_gain_coverage + coverage)))
             gains[taken] = -1.0
             taken.append(int(gains.argmax()))
             coverage += shown[taken[-1]]
@@ -276,7 +276,7 @@ class Sampler:
         up = self.up.direction
         aim = self._some_targets(count, generator)
         angle, turn, pitch = torch.rand(3, count, generator=generator, **DOUBLES)
-        small, large = LOOKING.apparent_sizes
+        small, large = looking().apparent_sizes
         distance = means_around(self._log_widths, 9)[aim].exp() / (small * (large / small) ** angle)
         distance = torch.where(distance < UNITS, distance, UNITS * angle).clamp_min(0.01 * UNITS)
         pitch = math.pi * (pitch - 0.5)
@@ -298,7 +298,7 @@ class Sampler:
             traces.shares.float(), count, replacement=True, generator=generator
         )
         offsets = torch.randn(count, 3, generator=generator, **DOUBLES)
-        eyes = traces.places[drawn] + LOOKING.photo_place_deviation * offsets
+        eyes = traces.places[drawn] + looking().photo_place_deviation * offsets
         eyes = eyes + (self._floor - eyes @ up).clamp_min(0)[:, None] * up
         return look_at(eyes, self.few.means[self._some_targets(count, generator)].double(), up)
 

@@ -7,8 +7,9 @@ measures what fields are worth.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 
@@ -105,23 +106,23 @@ class LookingSettings:
     """Standard deviation of candidates from photo places along each axis, units."""
 
 
-LOOKING = LookingSettings()
-"""The settings in use."""
+SHIPPED = LookingSettings()
+"""The settings that ship."""
+
+_in_use: ContextVar[LookingSettings] = ContextVar("looking", default=SHIPPED)
+
+
+def looking() -> LookingSettings:
+    """The settings in use: :data:`SHIPPED`, or those of the innermost :func:`use_settings`."""
+    return _in_use.get()
 
 
 @contextmanager
-def changed(values: Mapping[str, object]) -> Iterator[None]:
-    """Within, fields of the settings in use have other values, in every module: for measurements
-    and tests.
-
-    Raises:
-        AttributeError: if there is no such field.
-    """
-    before = {name: getattr(LOOKING, name) for name in values}
+def use_settings(settings: LookingSettings) -> Iterator[None]:
+    """Use other settings while the context is open: for measurements and tests. Threads that are
+    started elsewhere, and other processes, keep theirs."""
+    token = _in_use.set(settings)
     try:
-        for name, value in values.items():
-            object.__setattr__(LOOKING, name, value)  # every module holds this one object
         yield
     finally:
-        for name, value in before.items():
-            object.__setattr__(LOOKING, name, value)
+        _in_use.reset(token)

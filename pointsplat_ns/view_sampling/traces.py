@@ -25,7 +25,7 @@ from pointsplat_ns.rendering.spherical_harmonics import sh_basis
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.pieces import in_pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
-from pointsplat_ns.view_sampling.settings import LOOKING
+from pointsplat_ns.view_sampling.settings import looking
 
 MIN_SH = 1e-4
 """Length of a vector of SH coefficients, root of the sum of squares, up to which it counts as not
@@ -58,7 +58,7 @@ def traces_around(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
     energies = in_pieces(lambda rows: _energy(scene.features_rest[rows].double()), members)
     flatnesses = in_pieces(lambda rows: _flatness(scene.scales[rows].double()), members)
     energy, flatness = (
-        means_around(values, LOOKING.trace_neighbourhood) for values in (energies, flatnesses)
+        means_around(values, looking().trace_neighbourhood) for values in (energies, flatnesses)
     )
     return energy, flatness
 
@@ -67,10 +67,14 @@ def factors_of(energy: Tensor, flatness: Tensor) -> Tensor:
     """The mean energy (n,) and the exponential of the mean flatness (n,), each to a power, relative
     to the median, (n,) float32; 1 for all if all are equal."""
     logs = (
-        LOOKING.energy_exponent * (energy + MIN_SH**2).log() + LOOKING.flatness_exponent * flatness
+        looking().energy_exponent * (energy + MIN_SH**2).log()
+        + looking().flatness_exponent * flatness
     )
     return (
-        (logs - logs.median()).clamp(-LOOKING.max_log_factor, LOOKING.max_log_factor).exp().float()
+        (logs - logs.median())
+        .clamp(-looking().max_log_factor, looking().max_log_factor)
+        .exp()
+        .float()
     )
 
 
@@ -112,12 +116,12 @@ class PhotoTraces:
 
     def __init__(self, scene: Gaussians):
         generator = torch.Generator().manual_seed(0)
-        count = LOOKING.evidence_count
+        count = looking().evidence_count
         some = scene[
             torch.randperm(len(scene), generator=generator, device="cpu")[: 8 * count]
         ]  # some are faint
         sh = unit_sh(some.features_rest)
-        opaque = some.usable() & (some.alphas > LOOKING.min_opacity)
+        opaque = some.usable() & (some.alphas > looking().min_opacity)
         with_sh = opaque & (sh != 0).any(2).any(1)
         self.has_sh = bool(with_sh.any())
         """Whether SH are compared, not sizes."""
@@ -135,9 +139,11 @@ class PhotoTraces:
         self.places = 0.5 * (low + high) + 1.5 * (high - low) * offsets
         found = self.evidence(self.places)
         best = float(found.max())
-        shares = (found.clamp_min(0) / max(best, 1e-9)) ** LOOKING.photo_share_exponent + 1e-12
+        shares = (found.clamp_min(0) / max(best, 1e-9)) ** looking().photo_share_exponent + 1e-12
         self.shares = shares / shares.sum()
-        self.sure = best >= (LOOKING.min_sh_evidence if self.has_sh else LOOKING.min_size_evidence)
+        self.sure = best >= (
+            looking().min_sh_evidence if self.has_sh else looking().min_size_evidence
+        )
 
     def evidence(self, places: Tensor) -> Tensor:
         """Evidence for each place (P, 3), (P,) float32: the mean of the :func:`explained_energy`;

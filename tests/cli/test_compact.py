@@ -25,6 +25,8 @@ from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.tools import comparison_plots as pictures
 from pointsplat_ns.tools.pages.flight import FlightFrame
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def room(n: int = 150) -> Gaussians:
     return ball(n, log_size=-1.0, opacity=1.0, bright=1.0)

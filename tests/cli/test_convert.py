@@ -10,6 +10,8 @@ import pointsplat_ns as ps
 from making import cloud, same
 from pointsplat_ns.system.files import bytes_text, three_digits
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture
 def scene(tmp_path):

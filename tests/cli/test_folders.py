@@ -22,6 +22,8 @@ from making import ball, same
 from pointsplat_ns.scene.formats import format_like, format_to_read
 from pointsplat_ns.tools import folders
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:

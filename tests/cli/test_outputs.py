@@ -11,6 +11,8 @@ from making import ball
 from pointsplat_ns.cli import main
 from pointsplat_ns.pipeline import repair
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 FAILING = (
     "prune damaged.ply -o OUT.ply",
     "compact damaged.ply -o OUT.spz",

@@ -16,6 +16,8 @@ from pointsplat_ns.pipeline import view_provider
 from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 COUNT = 60
 
 

@@ -22,6 +22,8 @@ from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.view_sampling.sampler import sample_views
 from posing import inria, written
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 SEED = 5
 
 

@@ -26,6 +26,8 @@ from documented import (
 )
 from pointsplat_ns.cli.help import EXAMPLES
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-print-completion"}
 """Options that the documentation names and that belong to programs of others."""
 

@@ -12,6 +12,8 @@ from making import ball, write_run
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.scene.ply import read_ply, write_ply
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture()
 def small_example(tmp_path, monkeypatch):

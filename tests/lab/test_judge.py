@@ -20,6 +20,8 @@ from pointsplat_ns.refinement import Refiner, preset, save_refiner
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.scene.reading import read_scene
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 VIEWS = {
     "scene": "small",
     "about": "The walls of a room, from its middle.",

@@ -12,8 +12,6 @@ from lab.speed import beside, rasterizer
 from making import box_room
 from peers import peer
 from pointsplat_ns.scene.ply import write_ply
-from pointsplat_ns.view_sampling.settings import changed
-from quick_looking import USUAL
 
 JUDGED = RECORD / "judge.json", RECORD / "judge_photos.json"
 
@@ -30,8 +28,7 @@ PAGES = {
 
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_of_the_record_is_what_its_program_writes_from_the_rows(name):
-    with changed(USUAL):
-        assert PAGES[name]() == (RECORD / name).read_text("utf-8")
+    assert PAGES[name]() == (RECORD / name).read_text("utf-8")
 
 
 def test_the_table_of_the_readme_is_that_of_the_record_which_is_small():

@@ -30,6 +30,8 @@ from pointsplat_ns.pipeline.repair_budget import PHOTO_STEPS
 from pointsplat_ns.scene.image_files import in_unit_range
 from pointsplat_ns.scene.views import EPS2D, NEAR_PLANE, Views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
 

@@ -15,9 +15,12 @@ from pointsplat_ns.scene.runs import open_run
 RUN = SHARED_DATA / "splatfacto" / "fox" / "splatfacto" / "2026-11-26_gsplat"
 CAPTURE = SHARED_DATA / "scannetpp" / "fox"
 
-pytestmark = pytest.mark.skipif(
-    not RUN.is_dir() or not CAPTURE.is_dir(), reason="the genuine run is not at hand"
-)
+pytestmark = [
+    pytest.mark.usefixtures("quick"),
+    pytest.mark.skipif(
+        not RUN.is_dir() or not CAPTURE.is_dir(), reason="the genuine run is not at hand"
+    ),
+]
 
 
 @pytest.fixture(scope="module")

@@ -28,8 +28,6 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.sampler import sample_views
 
-pytestmark = pytest.mark.usefixtures("usual_looking")
-
 ROOM = 5500
 THINGS = 3000
 PLANTED = 12

@@ -27,6 +27,8 @@ from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 TINY = {
     "enc_channels": (8, 8),
     "enc_depths": (1, 1),

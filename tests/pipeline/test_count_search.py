@@ -25,6 +25,8 @@ from pointsplat_ns.scene.formats.rounding import rounding_for
 from pointsplat_ns.scene.formats.spz import encode_spz
 from pointsplat_ns.scene.gaussians import Gaussians
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 MOST = 100_000
 
 MEASURES = {

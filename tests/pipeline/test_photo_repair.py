@@ -37,6 +37,8 @@ from pointsplat_ns.scene.views import EPS2D
 from pointsplat_ns.tools.wording import stage_text
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 CPU = torch.device("cpu")
 
 

@@ -16,6 +16,8 @@ from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def scene() -> Gaussians:

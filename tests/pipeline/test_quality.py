@@ -21,6 +21,8 @@ from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.reading import save
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 SOME = Quality(28.84, 24.2, 0.9132, 12, 1920, 1080, "given views", 33.84, 12.06)
 
 

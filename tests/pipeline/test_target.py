@@ -15,6 +15,8 @@ from pointsplat_ns.pipeline.repair import Repaired
 from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def dense() -> ps.Gaussians:

@@ -13,6 +13,8 @@ from pointsplat_ns.pipeline.trained_refiner import load_refiner, open_refiner_ru
 from pointsplat_ns.pruning import PruneSettings, prune
 from pointsplat_ns.refinement import WeightsError, save_refiner
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.mark.parametrize(
     ("metadata", "settings"),

@@ -9,15 +9,18 @@ import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from nerfstudio.data.utils import colmap_parsing_utils
+from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 from PIL import Image
 from refusing import fails
 
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices, viewmats_to_opengl
 from pointsplat_ns.scene.camera_files import cameras, is_camera_file, read_named_views
-from posing import inria, name_of, nerfstudio, write_sparse, written
+from posing import inria, name_of, nerfstudio, write_colmap, write_sparse, written
 
 
 def read_views(path: Path) -> ps.Views:
@@ -115,6 +118,38 @@ def test_a_camera_of_3dgs_looks_along_its_third_column(tmp_path):
     )  # z is up
     torch.testing.assert_close((view.viewmat @ ahead)[:3], torch.tensor([0.0, 0.0, 2.0]).double())
     torch.testing.assert_close((view.viewmat @ below)[:3], torch.tensor([0.0, 1.0, 2.0]).double())
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".bin"])
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", (50.0, 30.5, 25.25)),
+        ("PINHOLE", (50.0, 52.0, 30.5, 25.25)),
+        ("SIMPLE_RADIAL", (50.0, 30.5, 25.25, 0.0)),
+        ("RADIAL", (50.0, 30.5, 25.25, 0.0, 0.0)),
+        ("OPENCV", (50.0, 52.0, 30.5, 25.25, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_colmap_models_are_what_nerfstudio_reads(model, params, suffix, tmp_path):
+    """The oracle is nerfstudio's own reader: names, poses, and focal lengths and principal points
+    of each model, from the same files."""
+    viewmats = some_views(12).viewmats.numpy()
+    poses = {name_of(index): viewmat for index, viewmat in enumerate(viewmats)}
+    folder = write_colmap(tmp_path, suffix, (model, 64, 48, [*params]), poses)
+    cameras, images, _ = colmap_parsing_utils.read_model(str(folder), suffix)
+    images = {image.name: image for image in images.values()}
+    found = read_named_views(folder)
+    names = [camera.name for camera in found.cameras]
+    assert sorted(names) == sorted(images) and len(images) == 12
+    for name, view in zip(names, found.views, strict=True):
+        image = images[name]
+        # 1e-9: both make the same rotation of one quaternion in float64
+        assert np.allclose(view.viewmat[:3, :3].numpy(), image.qvec2rotmat(), atol=1e-9)
+        assert np.allclose(view.viewmat[:3, 3].numpy(), image.tvec, atol=1e-9)
+        lens = parse_colmap_camera_params(cameras[image.camera_id])
+        expected = [[lens["fl_x"], 0, lens["cx"]], [0, lens["fl_y"], lens["cy"]], [0, 0, 1]]
+        assert view.K.tolist() == expected and (view.width, view.height) == (lens["w"], lens["h"])
 
 
 def test_poses_are_moved_to_where_nerfstudio_trains(tmp_path):

@@ -170,6 +170,16 @@ def test_a_parameter_that_is_missing_or_cannot_be_one_is_named(
 GOOD = normal_scene(4, 1)
 
 
+class Touches:
+    """Makes a file when it is unpickled as usual."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (Path.touch, (self.path,))
+
+
 def splats_of(scene):
     """What ``splats.state_dict()`` of gsplat's simple_trainer holds: a ParameterDict, opacities
     (N,), sh0 (N, 1, 3)."""
@@ -237,6 +247,46 @@ def test_a_part_of_a_training_on_several_gpus_is_refused(tmp_path):
 def test_a_checkpoint_of_gsplat_that_cannot_be_one_is_refused(tmp_path, changes, said):
     torch.save({"step": 1, "splats": {**splats_of(GOOD), **changes}}, tmp_path / "a.pt")
     fails(tmp_path / "a.pt", said)
+
+
+@pytest.mark.parametrize("where", ["beside", "inside", "in place of a tensor", "in place of all"])
+@pytest.mark.parametrize("zipped", [True, False], ids=["archive", "legacy"])
+def test_a_checkpoint_of_gsplat_that_would_run_code_is_refused_and_runs_none(
+    tmp_path, where, zipped
+):
+    """Told apart by a file that the code in it would make; torch itself, told to trust it, does."""
+    mark = tmp_path / "mark"
+    bomb = Touches(mark)
+    splats = splats_of(GOOD)
+    contents = {
+        "beside": {"step": 1, "splats": splats, "pose_adjust": bomb},
+        "inside": {"step": 1, "splats": {**splats, "extra": bomb}},
+        "in place of a tensor": {"step": 1, "splats": {**splats, "sh0": bomb}},
+        "in place of all": bomb,
+    }
+    path = tmp_path / "ckpt_29999_rank0.pt"
+    torch.save(contents[where], path, _use_new_zipfile_serialization=zipped)
+    fails(path, "holds an object of type")
+    assert not mark.exists()
+    torch.load(path, weights_only=False)
+    assert mark.exists()
+
+
+@pytest.mark.parametrize("zipped", [True, False], ids=["archive", "legacy"])
+def test_a_tensor_of_gsplat_that_lies_outside_its_storage_is_refused(tmp_path, zipped):
+    """Sizes of tensors are in the pickle: what lies behind the values of the file is never read."""
+    path = tmp_path / "a.pt"
+    content = {"step": 1, "splats": splats_of(GOOD)}
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    small = b"K\x00K\x04K\x03\x86"  # means (4, 3) from 0, as pickled
+    large = b"K\x00K\xffK\x03\x86"
+    if zipped:
+        entries = rewritten(path, lambda _, data: data.replace(small, large, 1))
+        assert any(large in data for data in entries.values())
+    else:
+        assert small in path.read_bytes()
+        path.write_bytes(path.read_bytes().replace(small, large, 1))
+    fails(path, "truncated or not a checkpoint")
 
 
 def read(tmp_path, text):

@@ -18,6 +18,8 @@ from pointsplat_ns.scene.formats.coding import morton_order
 from pointsplat_ns.scene.formats.splat import drawing_order
 from pointsplat_ns.scene.formats.spz import FARTHEST, HOLDS, fraction_bits
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @functools.cache
 def room():

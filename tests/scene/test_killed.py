@@ -13,7 +13,10 @@ from making import cloud
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.tools.levels.folder import write_levels
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="kills processes that it forks")
+pytestmark = [
+    pytest.mark.usefixtures("quick"),
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="kills processes that it forks"),
+]
 
 WORK = """
 import os, resource, shutil, signal, sys

@@ -16,6 +16,8 @@ from pointsplat_ns.pipeline.photos.posed_scene import read_found
 from pointsplat_ns.scene.offsets import offset_for
 from posing import inria, written
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 UTM = (451_234.6, 5_412_345.7, 312.4)
 
 

@@ -22,6 +22,8 @@ from pointsplat_ns.scene.formats.rounding import ROUNDING, rounding_for, steps_o
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import read_ply, write_ply
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 SILENT = lambda *told: None  # noqa: E731
 
 

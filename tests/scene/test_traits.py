@@ -16,6 +16,8 @@ from pointsplat_ns.geometry.transforms import direction_of
 from pointsplat_ns.rendering.scenes import pixels_of
 from pointsplat_ns.scene.gaussians import Traits
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def trained_so(scene):
     return scene.replace(antialiased=True)

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 import pointsplat_ns as ps
@@ -13,6 +14,8 @@ from pointsplat_ns.pipeline import repair
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refinement import Refiner, preset, save_refiner
 from pointsplat_ns.system.threads import fixed_threads
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @contextmanager

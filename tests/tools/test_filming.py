@@ -14,6 +14,8 @@ from making import ball, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.tools.pages.image_encoding import to_uint8
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 SMALL = {"width": 64, "height": 48, "fps": 10}
 
 

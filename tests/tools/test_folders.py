@@ -13,6 +13,8 @@ from making import ball
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.tools import folders
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture()
 def folder(tmp_path) -> Path:

@@ -14,6 +14,8 @@ from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.view_sampling.upright import up_named
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def test_rows_that_look_wrong_are_counted():
     scene = cloud(100, 0, 2)

@@ -12,12 +12,11 @@ from making import SHARED_DATA, ball, box_room, in_pictures
 from pointsplat_ns.api import example_room
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene
-from pointsplat_ns.view_sampling import upright
 from pointsplat_ns.view_sampling.content import thinned
 from pointsplat_ns.view_sampling.opening_views import opening_views
 from pointsplat_ns.view_sampling.poses import look_at, views_of
 from pointsplat_ns.view_sampling.sampler import Sampler
-from pointsplat_ns.view_sampling.settings import LOOKING
+from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
 from pointsplat_ns.view_sampling.upright import Up, upright_axis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -103,13 +102,13 @@ def test_an_object_is_whole_and_upright_from_every_side(turn, width, height):
 @pytest.mark.parametrize(
     "axis", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
 )
-def test_up_is_the_side_from_which_more_is_seen(axis, monkeypatch):
+def test_up_is_the_side_from_which_more_is_seen(axis):
     turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
     scene = turned(corner(), turn)
     assert Sampler(scene).up.direction.tolist() == list(map(float, axis))
     if axis == (0, 1, 0):
-        monkeypatch.setattr(upright, "LOOKING", replace(LOOKING, min_seen_from_above=math.inf))
-        assert Sampler(scene).up.direction.tolist() == [0.0, -1.0, 0.0]
+        with use_settings(replace(SHIPPED, min_seen_from_above=math.inf)):
+            assert Sampler(scene).up.direction.tolist() == [0.0, -1.0, 0.0]
 
 
 def test_a_room_is_first_seen_from_inside_and_then_from_other_sides():

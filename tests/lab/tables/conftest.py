@@ -14,6 +14,7 @@ from making import box_room
 from pointsplat_ns.pipeline import repair, view_provider
 from pointsplat_ns.refinement import Refiner, preset
 from pointsplat_ns.refinement.weights import save_refiner
+from quick import quick_settings
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +36,8 @@ def weights(tmp_path_factory) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def views_of_room() -> ps.Views:
-    return ps.sample_views(box_room(0, 400), 3, 48, 36)
+    with quick_settings():
+        return ps.sample_views(box_room(0, 400), 3, 48, 36)
 
 
 @pytest.fixture()

@@ -15,6 +15,8 @@ from peers import peer
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def cells_of(tables) -> dict:
     """Cells of the only scene, by way and share."""

@@ -15,6 +15,8 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.refinement import Refiner, preset
 from pointsplat_ns.refinement.weights import save_refiner
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 NUMBER = {job.name: f"{number}/16" for number, job in enumerate(jobs(), 1)}
 """Shards of one network each."""
 

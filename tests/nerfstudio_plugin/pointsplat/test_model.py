@@ -28,6 +28,8 @@ from pointsplat_ns.scene.gaussians import PARAMETERS
 from pointsplat_ns.scene.ply import read_ply
 from pointsplat_ns.scene.runs import open_run
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def test_untrained_the_refined_scene_is_the_pruned_one_to_the_bit(trained_walls):
     pipeline = pipeline_of(trained_walls)

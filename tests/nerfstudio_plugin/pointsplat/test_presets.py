@@ -17,6 +17,8 @@ from pointsplat_ns.refinement import Refiner
 from pointsplat_ns.refinement.weights import read_metadata
 from pointsplat_ns.scene.runs import RUN_FILES
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 PRESETS = {"paper": paper_config, "authors": authors_config}
 
 # The paper's text and what is known of the released code, read independently of presets.py.

@@ -25,6 +25,8 @@ from pointsplat_ns.scene.runs import open_run
 from pointsplat_ns.scene.views import EPS2D, Views
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def manager_of(folder: Path, **settings):
     return ScenesDataManagerConfig(data=folder, cache_gigabytes=0.01, **settings).setup(

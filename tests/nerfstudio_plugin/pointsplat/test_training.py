@@ -19,6 +19,8 @@ from pointsplat_ns.refinement import read_refiner
 from pointsplat_ns.refinement.weights import read_metadata
 from pointsplat_ns.scene.runs import RUN_FILES
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
     config, trainer = trained

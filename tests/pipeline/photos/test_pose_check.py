@@ -12,6 +12,8 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.pipeline.photos.pose_check import likeness, pose_faults
 from pointsplat_ns.scene.rotation import Similarity
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def statue(count: int = 3000, scale: float = 1.0) -> ps.Gaussians:
     """An object on an empty background, of small Gaussians on a ball, with three large floaters

@@ -23,6 +23,8 @@ from pointsplat_ns.scene.rotation import Similarity
 from pointsplat_ns.view_sampling.poses import look_at, views_of
 from posing import inria, name_of, nerfstudio, write_photos, write_sparse
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 COUNT = 18
 
 

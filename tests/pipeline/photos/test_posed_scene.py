@@ -21,6 +21,8 @@ from pointsplat_ns.scene.rotation import Similarity
 from pointsplat_ns.tools.placing import run_frame
 from posing import nerfstudio, write_photos, write_sparse, written
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def views(scene) -> ps.Views:

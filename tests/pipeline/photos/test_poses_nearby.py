@@ -15,6 +15,8 @@ from pointsplat_ns.pipeline.options import ViewOptions
 from pointsplat_ns.pipeline.subject import read_subject
 from posing import inria, nerfstudio, write_photos, write_sparse
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def views(scene) -> ps.Views:

@@ -22,9 +22,10 @@ from pointsplat_ns.pruning.merging.visibility import views_and_weights
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import PlyRows, header_bytes, read_ply, row_table, write_ply
-from pointsplat_ns.view_sampling import sampler as sampling
 from pointsplat_ns.view_sampling.sampler import Sampler, sample_views
-from pointsplat_ns.view_sampling.settings import LOOKING
+from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def rows_of(scene: Gaussians, folder: Path) -> PlyRows:
@@ -88,27 +89,27 @@ def test_views_and_weights_are_those_of_merging_in_memory(scene, tolerance, tmp_
     """A tolerance for the size of the content, and for the median of traces, both by a sample."""
     scene.opacities[::7] = -9.0  # too faint
     monkeypatch.setattr(state, "SAMPLED", 1 << 9)
-    monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=900))
     settings = replace(MERGING, sampled_views=4, min_count_rendered=0, max_count_drawn=600)
-    _, weights = views_and_weights(
-        Participants.of(scene, drawable(scene, 400)), Sampler(scene), settings
-    )
-    merged(rows_of(scene, tmp_path), 400, 900, tmp_path, settings)
+    with use_settings(replace(SHIPPED, sampled_count=900)):
+        _, weights = views_and_weights(
+            Participants.of(scene, drawable(scene, 400)), Sampler(scene), settings
+        )
+        merged(rows_of(scene, tmp_path), 400, 900, tmp_path, settings)
     overview = Scratch(tmp_path / "cells-400-900", {}).known("overview")
     assert torch.allclose(
         overview["weights"].log(), weights[:: int(overview["step"])].log(), atol=tolerance
     )
 
 
-@pytest.mark.usefixtures("usual_looking")
 def test_cells_lose_no_more_than_the_whole_and_leave_no_seam(tmp_path):
     scene = box_room(seed=3, count=3000, size=0.15)
     rows = rows_of(scene, tmp_path)
     k = 300
     settings = replace(MERGING, sampled_views=8, finish_views=2, min_count_rendered=0)
-    whole = merge(scene, k, settings=settings).scene
-    parts = merged(rows, k, 750, tmp_path, settings)
-    reference = DenseReference(scene, sample_views(scene, 6, width=80, height=60, seed=9))
+    with use_settings(SHIPPED):
+        whole = merge(scene, k, settings=settings).scene
+        parts = merged(rows, k, 750, tmp_path, settings)
+        reference = DenseReference(scene, sample_views(scene, 6, width=80, height=60, seed=9))
     assert (
         reference.psnr(parts)[0] > reference.psnr(whole)[0] - 0.6
     )  # as much as eight other views change

@@ -14,6 +14,8 @@ from pointsplat_ns.pruning.merging.groups import deepened
 from pointsplat_ns.rendering.constants import ALPHA_MAX
 from pointsplat_ns.scene.gaussians import Gaussians
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 RENDERED = replace(MERGING, min_count_rendered=0, sampled_views=8)
 """Settings with which the smallest scenes are rendered."""
 

@@ -117,36 +117,45 @@ def test_costs_are_finite_and_not_negative_at_the_extremes(compiled):
     assert bool(costs.isfinite().all()) and bool((costs >= 0).all())
 
 
-@needs_compiler
-@pytest.mark.parametrize(("k", "axes"), [(1, 1), (6, 8), (8, 3)])
-def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
-    """Gaussians of a splat's proportions, some of them opaque, so that replacements grow. A cost is
-    the difference of larger numbers, so the error of either is a share of the larger ones of a
-    Gaussian's costs."""
-    g = torch.Generator().manual_seed(2)
-    n = 500
-    scene = Gaussians(
-        means=torch.rand(n, 3, generator=g),
-        scales=torch.tensor([-2.5, -3.0, -6.0]) + 0.5 * torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        opacities=4 * torch.randn(n, 1, generator=g),
-        features_dc=torch.randn(n, 3, generator=g),
-        features_rest=torch.randn(n, 3, 3, generator=g),
+def crowded(n: int, generator: torch.Generator) -> Gaussians:
+    """Gaussians of a splat's proportions, the second half beside those of the first. None has so
+    little opacity that its cost nearly vanishes, which no float32 could tell from 0."""
+    half = torch.rand(n // 2, 3, generator=generator)
+    beside = half + 0.02 * torch.randn(n // 2, 3, generator=generator)
+    flat = torch.tensor([-2.5, -3.0, -6.0])
+    return Gaussians(
+        means=torch.cat([half, beside]),
+        scales=flat + 0.3 * torch.randn(n, 3, generator=generator),
+        quats=torch.randn(n, 4, generator=generator),
+        opacities=torch.empty(n, 1).uniform_(-1, 5, generator=generator),
+        features_dc=torch.randn(n, 3, generator=generator),
+        features_rest=torch.randn(n, 3, 3, generator=generator),
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
+@pytest.mark.parametrize(("k", "axes"), [(1, 1), (6, 8), (8, 3)])
+def test_costs_in_float32_are_as_near_to_float64_as_their_terms_allow(k, axes, compiled, seed):
+    """Both of kernels and of torch, within one bound. A cost is a sum of six terms that cancel to a
+    hundredth, rarely to a thousandth. Of 40 seeds the largest relative errors, in units of
+    float32's rounding, were 7.2 (median), 234 (99 %) and 3037 (all): less than half the bounds."""
+    g = torch.Generator().manual_seed(seed)
+    n = 500
+    scene = crowded(n, g)
     participants = Participants(
         scene, torch.arange(n), torch.full((3,), 0.5, dtype=torch.float64), 1.7
     )
     state = initial_state(participants, torch.rand(n, generator=g))
     state = replace(state, colours=state.colours[:, -axes:].contiguous())
     near = torch.randint(0, n, (n, k), generator=g, dtype=torch.int32)
-    exact = pair_costs(state, near, dtype=torch.float64)
-    scale = exact.amax(1, keepdim=True)
-    kernels, torchs = (
-        ((pair_costs(state, near, compiled=on) - exact) / scale).abs() for on in (True, False)
-    )
-    # Torch projects in float64; the square of the growth makes most of that in the largest errors.
-    for share, times in ((0.5, 2), (0.99, 4), (1.0, 5)):
-        assert float(kernels.quantile(share)) < times * float(torchs.quantile(share))
+    near[:, 0] = (torch.arange(n) + n // 2) % n  # the one beside it: replacements grow
+    others = near != torch.arange(n)[:, None]
+    exact = pair_costs(state, near, dtype=torch.float64)[others]
+    found = pair_costs(state, near, compiled=compiled)[others].double()
+    errors = (found - exact).abs() / exact / 2**-24
+    for share, bound in ((0.5, 15), (0.99, 500), (1.0, 8000)):
+        assert float(errors.quantile(share)) < bound
 
 
 def test_float32_costs_rank_pairs_as_float64_does():

@@ -14,10 +14,11 @@ from pointsplat_ns.pruning.merging.visibility import covered_per_area, views_and
 from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
-from pointsplat_ns.view_sampling import traces
 from pointsplat_ns.view_sampling.poses import look_at
 from pointsplat_ns.view_sampling.sampler import Sampler, sample_views
-from pointsplat_ns.view_sampling.settings import LOOKING
+from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def of_origin(*eyes: tuple[float, float, float], width: int = 64, height: int = 48) -> Views:
@@ -104,14 +105,14 @@ def test_traces_count_where_sh_tell_of_photos_and_fog_has_no_views(monkeypatch):
     monkeypatch.setattr(
         visibility, "trace_factors", lambda scene, members: torch.full((len(members),), 16.0)
     )
-    monkeypatch.setattr(
-        traces, "LOOKING", replace(LOOKING, min_size_evidence=-1.0)
-    )  # without SH, all are sure
+    # Without SH, all are sure.
+    all_sure = replace(SHIPPED, min_size_evidence=-1.0)
     settings = replace(MERGING, sampled_views=2, min_count_rendered=0)
     fog = ball(200).replace(opacities=torch.full((200, 1), -math.inf))
     for scene, weight in ((photographed(), 8.0), (ball(500, 0), 0.5), (fog, 1.0)):
         participants = Participants.of(scene, torch.arange(len(scene)))
-        views, weights = views_and_weights(participants, Sampler(scene, (32, 24)), settings)
+        with use_settings(all_sure):
+            views, weights = views_and_weights(participants, Sampler(scene, (32, 24)), settings)
         assert weights.tolist() == [weight] * len(scene) and (views is None) == (scene is fog)
 
 

@@ -20,6 +20,8 @@ from pointsplat_ns.rendering.comparison.sizes import (
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.sampler import sample_views
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def scene():

@@ -17,6 +17,8 @@ from pointsplat_ns.scene.formats.sog_stream import read_sog_stream
 from pointsplat_ns.tools.levels import folder as level_folder
 from pointsplat_ns.tools.levels.stream import Node, partition
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 ASKED = ("50%", "25%", "10%", "3%")
 
 

@@ -18,6 +18,8 @@ from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.scene.formats import rad
 from pointsplat_ns.tools.levels.paged import write_paged
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 TYPES = {
     "f32_lebytes": "u1",
     "f16": "<f2",

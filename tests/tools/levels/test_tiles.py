@@ -22,6 +22,8 @@ from pointsplat_ns.tools.levels.errors import pixel_size_for
 from pointsplat_ns.tools.levels.levels import LevelOutput
 from pointsplat_ns.tools.levels.tiles import write_tiles
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 """What viewers of 3D Tiles do to glTF."""
 

@@ -17,6 +17,8 @@ from pointsplat_ns.view_sampling.opening_views import Opening
 from pointsplat_ns.view_sampling.poses import look_at
 from pointsplat_ns.view_sampling.upright import Up
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def views_at(eyes: torch.Tensor, targets: torch.Tensor, up: torch.Tensor | None = None) -> ps.Views:
     K = torch.tensor([[50.0, 0.0, 33.0], [0.0, 52.0, 24.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

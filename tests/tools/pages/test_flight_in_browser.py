@@ -29,9 +29,10 @@ from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
-pytestmark = pytest.mark.xdist_group(
-    "flight"
-)  # one process starts Chromium for all tests of this file
+pytestmark = [
+    pytest.mark.usefixtures("quick"),
+    pytest.mark.xdist_group("flight"),
+]  # one process starts Chromium for all tests of this file
 
 
 @pytest.fixture()

@@ -13,6 +13,8 @@ from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.tools.pages import slider_scenes as module
 from pointsplat_ns.tools.pages.slider_scenes import ViewedScene
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def scene() -> ps.Gaussians:

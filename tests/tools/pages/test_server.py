@@ -20,6 +20,8 @@ from pointsplat_ns.tools.pages import viewer as viewing
 from pointsplat_ns.tools.pages.server import LOCAL, refusal
 from pointsplat_ns.tools.pages.viewer import Viewer
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(scope="module")
 def viewer() -> Iterator[Viewer]:

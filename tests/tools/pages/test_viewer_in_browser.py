@@ -21,9 +21,10 @@ from pointsplat_ns.view_sampling.upright import Up
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.webdriver.common.by import By  # noqa: E402
 
-pytestmark = pytest.mark.xdist_group(
-    "browser"
-)  # one process starts Chromium for all tests of this file
+pytestmark = [
+    pytest.mark.usefixtures("quick"),
+    pytest.mark.xdist_group("browser"),
+]  # one process starts Chromium for all tests of this file
 
 START = """
 import signal, sys

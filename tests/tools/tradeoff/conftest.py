@@ -11,6 +11,7 @@ from pointsplat_ns.pipeline import repair, view_provider
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.tools.tradeoff.points import Tradeoff
 from pointsplat_ns.view_sampling.sampler import sample_views
+from quick import quick_settings
 
 
 @pytest.fixture(scope="session")
@@ -24,7 +25,8 @@ def room(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def room_views(room) -> Views:
     """Three small views of it."""
-    return sample_views(ps.load(room), 3, 48, 36)
+    with quick_settings():
+        return sample_views(ps.load(room), 3, 48, 36)
 
 
 @pytest.fixture()

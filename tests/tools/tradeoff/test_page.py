@@ -15,6 +15,8 @@ from pointsplat_ns.tools.tradeoff.measure_table import write_page
 from pointsplat_ns.tools.tradeoff.points import Tradeoff
 from trades import POINTS
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 HOSTILE = (
     "<script>document.title='run'</script><img src=x onerror=\"document.title='run'\">\"'&</title>"
 )

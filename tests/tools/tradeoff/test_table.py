@@ -35,6 +35,8 @@ from pointsplat_ns.tools.tradeoff.recommend import (
 from pointsplat_ns.tools.tradeoff.subject import Subject, make
 from trades import POINTS, point
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def test_the_figures_are_returned_and_written_beside_a_page(measured, tmp_path, monkeypatch):
     monkeypatch.setattr(measuring, "_timed", lambda scene, view: 1e-5 * len(scene))
