@@ -29,7 +29,7 @@ from PIL import Image
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.scene.image_files import IMAGE_ERRORS, exif_hint, open_image
+from pointsplat_ns.scene.image_files import IMAGE_ERRORS, MOST_PIXELS, exif_hint, open_image
 from pointsplat_ns.system.files import one_line
 from pointsplat_ns.system.tensors import DOUBLES
 
@@ -187,7 +187,7 @@ def _undistorted(
 
 
 def _need_sound_cameras(dataset: InputDataset) -> None:
-    """Refuse cameras with NaN or infinity, and photos of a scene that moves. Those without times
+    """Refuse cameras with NaN, infinity or a size of no photo, and photos of a scene that moves. Those without times
     are taken to be of a still scene."""
     cameras = dataset.cameras
     paths = dataset.image_filenames
@@ -202,6 +202,14 @@ def _need_sound_cameras(dataset: InputDataset) -> None:
             f"{paths[bad[0]]}: the pose or the intrinsics of frame {bad[0]} hold NaN or infinity, "
             f"as do those of {len(bad) - 1} more of {len(cameras)}; expected numbers; correct them "
             "or leave the photo out"
+        )
+    width = cameras.width[:, 0].double()
+    height = cameras.height[:, 0].double()
+    odd = ((width < 1) | (height < 1) | (width * height > MOST_PIXELS)).nonzero()[:, 0].tolist()
+    if odd:
+        raise DataError(
+            f"{paths[odd[0]]}: the camera of frame {odd[0]} has {int(width[odd[0]])} x "
+            f"{int(height[odd[0]])} pixels; expected the size of its photo"
         )
     if cameras.times is not None and len(cameras.times.unique()) > 1:
         raise DataError(
