@@ -214,3 +214,17 @@ def signals_as_they_were():
     before = signal.getsignal(signal.SIGTERM)
     yield
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.fixture()
+def time_limit() -> Iterator[None]:
+    """End a test that hangs, as one that waits for a pipe does, after two minutes."""
+
+    def hangs(number, frame):
+        pytest.fail("still running after 120 s")
+
+    before = signal.signal(signal.SIGALRM, hangs)
+    signal.alarm(120)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
@@ -17,6 +17,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, UndistortedDataset
+from pointsplat_ns.nerfstudio_plugin.image_guard import photos_alone
 
 
 @dataclass
@@ -41,6 +42,10 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
     config: LazyImageDatamanagerConfig
     latest_photo: str = ""
     """Name of the photo of the latest training step."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        with photos_alone():
+            super().__init__(*args, **options)
 
     @cached_property
     def frame_cache(self) -> MemoryCache:

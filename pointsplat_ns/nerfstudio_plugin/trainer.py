@@ -26,6 +26,7 @@ from tyro.conf import Fixed, Suppress
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
 from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
+from pointsplat_ns.scene.checkpoints import load_checkpoint
 from pointsplat_ns.scene.runs import step_of
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.files import one_line, replacing
@@ -123,6 +124,16 @@ class StoppableTrainer(Trainer):
             # nerfstudio takes the steps of this call for the last step, also where a training
             # resumes from a later one.
             writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
+
+    def _load_checkpoint(self) -> None:
+        """As nerfstudio's. Raises SceneError, before anything is loaded, if the checkpoint to
+        resume from is damaged, or asks for more memory than it has bytes."""
+        path = self.config.load_checkpoint
+        if self.config.load_dir is not None:
+            path = self.config.load_dir / f"step-{self.config.first_step() - 1:09d}.ckpt"
+        if path is not None and path.exists():  # of one that is missing nerfstudio says so
+            load_checkpoint(path)
+        super()._load_checkpoint()
 
     def train(self) -> None:
         """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130.

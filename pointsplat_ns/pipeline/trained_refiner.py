@@ -17,7 +17,7 @@ from pointsplat_ns.pipeline.options import default_device
 from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refinement import Refiner, WeightsError, preset, read_metadata, read_refiner
 from pointsplat_ns.refinement.weights import SHIPPED_REFINER
-from pointsplat_ns.scene.checkpoints import allow_splatfacto_checkpoints
+from pointsplat_ns.scene.checkpoints import load_checkpoint
 from pointsplat_ns.scene.discovery import find_runs_and_plys, shown_scene
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import METHOD_NAMES, Run, open_run
@@ -187,10 +187,7 @@ def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
     try:
         network = Refiner(preset(run.model_fields["size"], **network_options(run.model_fields)))
         settings = settings_from(run.model_fields)
-        allow_splatfacto_checkpoints()  # for the numbers in the schedulers' state
-        state = torch.load(run.checkpoint, map_location="cpu", weights_only=True, mmap=True)[
-            "pipeline"
-        ]
+        state = load_checkpoint(run.checkpoint)["pipeline"]
         prefix = "_model.refiner."
         network.load_state_dict(
             {k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)}

@@ -17,8 +17,10 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.scene.checkpoint_pickles import PickleRefused, need_bounded
 from pointsplat_ns.scene.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.system.files import one_line, read_text, require_file, require_memory
+from pointsplat_ns.system.opening import open_regular
 
 EXPECTED = "expected a checkpoint that Splatfacto or gsplat saved"
 
@@ -45,7 +47,7 @@ def read_checkpoint(path: Path | str) -> Gaussians:
             f"{path}: a part of a training on several GPUs; expected the whole scene; export a "
             "PLY with --save_ply"
         )
-    content = _load(path)
+    content = load_checkpoint(path)
     if isinstance(content, dict) and isinstance(
         content.get("splats"), dict
     ):  # of gsplat's simple_trainer
@@ -136,7 +138,7 @@ def read_photo_fit(path: Path | str) -> PhotoFit:
             numbers.
     """
     path = require_file(path, "a Splatfacto checkpoint")
-    state = _pipeline_state(_load(path), path)
+    state = _pipeline_state(load_checkpoint(path), path)
     names = [key for key in state if isinstance(key, str)]
     key = next((name for name in names if name.endswith("camera_optimizer.pose_adjustment")), None)
     adjustments = None if key is None else _parameter(state[key], key, path, path.stat().st_size)
@@ -180,28 +182,34 @@ def allow_splatfacto_checkpoints() -> None:
     torch.serialization.add_safe_globals([entry for entry in allowed if entry not in present])
 
 
-def _load(path: Path) -> Any:
-    """Load a checkpoint, with its tensors memory-mapped if it is an archive."""
+def load_checkpoint(path: Path) -> Any:
+    """What a checkpoint holds, with its tensors memory-mapped if it is an archive. Nothing of it is
+    run, and it takes memory in proportion to its size.
+
+    Raises:
+        SceneError: if it is no checkpoint, damaged, or asks for more.
+    """
+    require_file(path, "a checkpoint")
     if path.stat().st_size == 0:
         raise SceneError(f"{path}: the file is empty; {EXPECTED}")
     archive = is_complete(path)
-    if not archive and path.open("rb").read(2) == b"PK":
-        raise SceneError(
-            f"{path}: truncated, the archive has no end; {EXPECTED}; train or copy it again"
-        )
     allow_splatfacto_checkpoints()
     try:
-        if archive:
-            with zipfile.ZipFile(path) as content:
-                if sum(entry.file_size for entry in content.infolist()) > path.stat().st_size:
-                    raise SceneError(f"{path}: a compressed archive; {EXPECTED}")
+        with open_regular(path) as stream:
+            if not archive and stream.read(2) == b"PK":
+                raise SceneError(
+                    f"{path}: truncated, the archive has no end; {EXPECTED}; train or copy it again"
+                )
+        need_bounded(path)
         return torch.load(path, map_location="cpu", weights_only=True, mmap=archive)
     except SceneError:
         raise
     except Exception as error:  # a damaged pickle can raise nearly anything
         why = f"truncated or not a checkpoint ({type(error).__name__}: {one_line(error, 100)})"
         if foreign := re.search(r"GLOBAL ([\w.]+)", str(error)):
-            why = f"holds an object of type {foreign[1]}, which only running its code could load"
+            why = f"holds an object of type {foreign[1]}, which no scene needs, and is not loaded"
+        elif isinstance(error, PickleRefused):
+            why = f"truncated or not a checkpoint: {one_line(error, 100)}"
         raise SceneError(f"{path}: {why}; {EXPECTED}") from error
 
 

@@ -102,8 +102,8 @@ class Gaussians:
             poses, scene units, as that of a geo-referenced scene; None for (0, 0, 0).
 
     Raises:
-        SceneError: if a shape, device or dtype does not fit the others, no SH degree has this
-            number of coefficients, ``up`` is no axis, or ``offset`` is not three finite numbers.
+        SceneError: if a parameter is no tensor, a shape, device or dtype does not fit the others,
+            no SH degree has this number of coefficients, ``up`` is no axis, or ``offset`` is not three finite numbers.
 
     Example:
         Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside
@@ -145,6 +145,12 @@ class Gaussians:
             "opacities": (1,),
             "features_dc": (3,),
         }
+        for name, value in self.items():
+            if not isinstance(value, Tensor):
+                raise SceneError(
+                    f"{name} is a {type(value).__module__}.{type(value).__qualname__}; expected a "
+                    "torch.Tensor; torch.as_tensor makes one"
+                )
         n = self.means.shape[0] if self.means.dim() else -1
         for name, tail in tails.items():
             shape = tuple(getattr(self, name).shape)

@@ -2,13 +2,81 @@
 
 from __future__ import annotations
 
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pointsplat_ns.system.files import replacing
+from pointsplat_ns.system.opening import open_regular
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "PPM")
+"""Pillow's names of the formats that are decoded. Pillow decides by content, and hands PostScript
+to another program."""
+
+MOST_PIXELS = 150_000_000
+"""Largest image that is decoded: 450 MB as bytes of RGB."""
+
+IMAGE_ERRORS = (
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    SyntaxError,
+    EOFError,
+    MemoryError,
+    RuntimeError,
+    struct.error,
+)
+"""What Pillow raises for a damaged image."""
+
+
+@contextmanager
+def open_image(path: Path | str) -> Iterator[Image]:
+    """A JPEG, PNG, WebP, BMP, TIFF or PPM file as Pillow's image, of which the header is read. Its
+    pixels can be decoded until the context ends.
+
+    Raises:
+        OSError: if the file is missing, not a regular one, or none of these.
+        ValueError: if it has more than :data:`MOST_PIXELS`.
+    """
+    from PIL import Image
+
+    with open_regular(path) as stream:
+        start = stream.read(30)
+        stream.seek(0)
+        if start[:4] == b"RIFF":  # Pillow takes the memory of its pixels when it opens a WebP
+            _need_decodable(*webp_size(start))
+        with warnings.catch_warnings():  # of sizes below our limit
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            try:
+                image = Image.open(stream, formats=IMAGE_FORMATS)
+            except Image.UnidentifiedImageError as error:
+                raise OSError(f"not one of {', '.join(IMAGE_FORMATS)}") from error
+            except Image.DecompressionBombError as error:
+                raise ValueError(_too_large("too many")) from error
+        with image:
+            _need_decodable(*image.size)
+            yield image
+
+
+def _need_decodable(width: int, height: int) -> None:
+    if width * height > MOST_PIXELS:
+        raise ValueError(_too_large(f"{width} x {height}"))
+
+
+def _too_large(found: str) -> str:
+    return f"{found} pixels; expected at most {MOST_PIXELS / 1e6:.0f} million"
 
 
 def in_unit_range(image: Tensor) -> Tensor:
@@ -20,13 +88,11 @@ def exif_hint(path: Path, wanted: tuple[int, int]) -> str:
     """What to do with a photo of another size than its camera's, as the end of an error: about its
     EXIF orientation, if that turns it to the shape that is wanted (width and height, pixels); else
     empty. Photos are read as they are stored, which is how COLMAP reads them, too."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as photo:
+        with open_image(path) as photo:
             size = photo.size
             orientation = photo.getexif().get(274)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+    except IMAGE_ERRORS:
         return ""
     upright = (size[0] - size[1]) * (wanted[0] - wanted[1]) > 0  # or scaled
     if orientation not in (5, 6, 7, 8) or upright:  # those exchange width and height
@@ -38,17 +104,35 @@ def exif_hint(path: Path, wanted: tuple[int, int]) -> str:
     )
 
 
+def webp_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a WebP image in pixels, as its header says (RFC 9649); a ValueError if it
+    is none."""
+    kind = data[12:16]
+    head = data[20:30]
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(head) == 10:
+        if kind == b"VP8X":
+            return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
+        if kind == b"VP8L" and head[0] == 0x2F:
+            bits = int.from_bytes(head[1:5], "little")
+            return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+        if kind == b"VP8 ":
+            return int.from_bytes(head[6:8], "little") & 0x3FFF, int.from_bytes(
+                head[8:10], "little"
+            ) & 0x3FFF
+    raise ValueError("not a WebP image")
+
+
 def read_reduced(path: Path, side: int) -> Tensor | None:
     """An image file, reduced until its longer side is about ``side`` pixels: (H, W, 3) float32 in
     [0, 1], transparency over black; None if it cannot be read."""
     from PIL import Image
 
     try:
-        with Image.open(path) as opened:
+        with open_image(path) as opened:
             opened.draft("RGB", (side, side))  # JPEGs are decoded at an eighth of their size
             opened.thumbnail((side, side), Image.Resampling.BOX)
             image = torch.from_numpy(np.asarray(opened.convert("RGBA"), dtype=np.float32) / 255)
-    except (OSError, ValueError, SyntaxError, MemoryError, Image.DecompressionBombError):
+    except IMAGE_ERRORS:
         return None
     return image[..., :3] * image[..., 3:]
 

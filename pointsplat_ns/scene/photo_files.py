@@ -18,14 +18,11 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.lenses import Lens, lens_of, pixel_map
 from pointsplat_ns.scene.camera_files import NamedViews
 from pointsplat_ns.scene.camera_files.cameras import Camera
-from pointsplat_ns.scene.image_files import exif_hint
+from pointsplat_ns.scene.image_files import IMAGE_ERRORS, exif_hint, open_image
 from pointsplat_ns.system.files import one_line
 from pointsplat_ns.system.tensors import DOUBLES
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-
-MOST_PIXELS = 150_000_000
-"""Largest photo that is decoded: 450 MB as bytes of RGB."""
 
 
 def photo_files(folder: Path) -> list[str]:
@@ -131,7 +128,7 @@ class PhotoReader:
 
         size, turned = self._opened(path, camera)
         try:
-            with Image.open(path) as opened:
+            with open_image(path) as opened:
                 opened.draft(
                     "RGB", size[::-1] if turned else size
                 )  # JPEGs are decoded at a half or less
@@ -142,13 +139,7 @@ class PhotoReader:
                 )
                 upright = ImageOps.exif_transpose(opened) if turned else opened
                 picture = np.array(upright.convert(kind).resize(size, Image.Resampling.BOX))
-        except (
-            OSError,
-            ValueError,
-            SyntaxError,
-            MemoryError,
-            Image.DecompressionBombError,
-        ) as error:
+        except IMAGE_ERRORS as error:
             raise DataError(f"{path}: cannot be read as a photo ({one_line(error, 80)})") from error
         image = torch.from_numpy(picture)
         if image.shape[2] == 4:
@@ -176,20 +167,13 @@ class PhotoReader:
     def _opened(self, path: Path, camera: Camera) -> tuple[tuple[int, int], bool]:
         """The size that a photo will have, and whether its EXIF orientation is followed, which is
         so where the camera is that of the turned photo."""
-        from PIL import Image
-
         try:
-            with Image.open(path) as opened:
+            with open_image(path) as opened:
                 size = opened.size
                 mode = opened.mode
                 hint = exif_hint(path, (int(camera.size[0]), int(camera.size[1])))
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        except IMAGE_ERRORS as error:
             raise DataError(f"{path}: cannot be read as a photo ({one_line(error, 80)})") from error
-        if size[0] * size[1] > MOST_PIXELS:
-            raise DataError(
-                f"{path}: {size[0]} x {size[1]} pixels; expected at most {MOST_PIXELS / 1e6:.0f} "
-                "million"
-            )
         if mode.startswith(("I", "F")):
             raise DataError(
                 f"{path}: its pixels are of mode {mode}; expected 8 bits a channel; convert it"
@@ -233,17 +217,9 @@ class PhotoReader:
         if path is None:
             return None
         try:
-            with Image.open(path) as opened:
-                if opened.width * opened.height > MOST_PIXELS:
-                    raise ValueError(f"more than {MOST_PIXELS / 1e6:.0f} million pixels")
+            with open_image(path) as opened:
                 small = opened.convert("L").resize(size, Image.Resampling.BOX)
-        except (
-            OSError,
-            ValueError,
-            SyntaxError,
-            MemoryError,
-            Image.DecompressionBombError,
-        ) as error:
+        except IMAGE_ERRORS as error:
             raise DataError(f"{path}: cannot be read as a mask ({one_line(error, 80)})") from error
         return torch.from_numpy(np.array(small)).ge(128)[..., None]
 

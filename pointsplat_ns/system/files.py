@@ -4,7 +4,6 @@ writes."""
 from __future__ import annotations
 
 import csv
-import errno
 import hashlib
 import json
 import logging
@@ -22,6 +21,7 @@ from typing import Any
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.system.opening import open_regular
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -48,12 +48,11 @@ def read_text(path: Path, most: int = 1 << 26) -> str:
         OSError: if it is missing, a folder, a pipe or a device, or cannot be read.
         ValueError: if it is larger, or no text.
     """
-    found = path.stat()
-    if not stat.S_ISREG(found.st_mode):
-        raise OSError(errno.EINVAL, "not a regular file", str(path))
-    if found.st_size > most:
+    with open_regular(path) as stream:
+        content = stream.read(most + 1)
+    if len(content) > most:
         raise ValueError(f"larger than {most:,} bytes")
-    return path.read_text("utf-8")
+    return content.decode("utf-8")
 
 
 @contextmanager
@@ -89,7 +88,7 @@ def content_hash(path: Path | str) -> str:
     """
     path = require_file(path, "a scene to read")
     digest = hashlib.sha256()
-    with failure_named(path, "read"), path.open("rb") as stream:
+    with failure_named(path, "read"), open_regular(path) as stream:
         while piece := stream.read(1 << 20):
             digest.update(piece)
     return digest.hexdigest()

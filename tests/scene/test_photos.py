@@ -1,8 +1,6 @@
 """Photos of the cameras of a file: which file each is, and its pixels as a pinhole sees them."""
 
 import json
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +9,7 @@ import torch
 from PIL import Image
 
 from captures import FRAMES, HEIGHT, OPENCV_TO_OPENGL, WIDTH, Capture, Lens, colors_at, seen_from
+from hostile import POSTSCRIPT, png_of, webp_of
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.lenses import lens_of, pixel_map
 from pointsplat_ns.scene.camera_files import read_named_views
@@ -181,25 +180,16 @@ def test_a_photo_is_turned_by_exif_where_its_camera_is(tmp_path):
     assert torch.equal(reader.read(path, camera()).image, pixels)
 
 
-def png_of(width: int, height: int) -> bytes:
-    head = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    data = struct.pack(">I", 1000) + b"IDAT"
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + struct.pack(">I", 13)
-        + head
-        + struct.pack(">I", zlib.crc32(head))
-        + data
-    )
-
-
-@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+@pytest.mark.filterwarnings("error::PIL.Image.DecompressionBombWarning")
 @pytest.mark.parametrize(
     ("content", "text"),
     [
         (b"no photo", "cannot be read as a photo"),
         (png_of(64, 48), "cannot be read as a photo"),
-        (png_of(13_000, 12_000), "13000 x 12000 pixels; expected at most 150 million"),
+        (png_of(13_000, 12_000), r"cannot .* \(13000 x 12000 pixels; expected at most 150 million"),
+        (png_of(20_000, 20_000), r"cannot .* \(too many pixels; expected at most 150 million"),
+        (webp_of(16_383, 16_383), r"cannot .* \(16383 x 16383 pixels; expected at most 150"),
+        (POSTSCRIPT, r"cannot .* \(not one of JPEG, PNG"),
     ],
 )
 def test_photos_that_cannot_be_read_or_are_huge_are_named(content, text, tmp_path):

@@ -19,6 +19,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache, UndistortedDataset
+from pointsplat_ns.nerfstudio_plugin.image_guard import photos_alone
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, Split
 from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.scene.checkpoints import read_checkpoint, read_photo_fit
@@ -160,7 +161,8 @@ class TrainedScene(DenseScene):
         """The dataparser's outputs for a split. Raises DataError if the data is damaged, or its
         coordinate frame is not that of the Gaussians."""
         try:
-            outputs = self._dataparser.get_dataparser_outputs(split=split)
+            with photos_alone():
+                outputs = self._dataparser.get_dataparser_outputs(split=split)
         except PointSplatError:
             raise
         except (

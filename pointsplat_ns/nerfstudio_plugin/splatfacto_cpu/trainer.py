@@ -18,6 +18,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric
 from pointsplat_ns.nerfstudio_plugin.trainer import STATE, StoppableTrainer
+from pointsplat_ns.scene.checkpoints import load_checkpoint
 from pointsplat_ns.system.tensors import FLOATS
 
 if TYPE_CHECKING:
@@ -112,11 +113,7 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         path = self.config.load_checkpoint
         if folder is not None:
             path = folder / f"step-{self._start_step - 1:09d}.ckpt"
-        state = (
-            None
-            if path is None
-            else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
-        )
+        state = None if path is None else load_checkpoint(path).get(STATE)
         if state is None:  # those of nerfstudio's own methods have none
             return
         torch.set_rng_state(state["torch"])

@@ -34,17 +34,18 @@ def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
     :func:`~pointsplat_ns.scene.camera_files.camera_files_near`; None if there is none that belongs to
     the scene.
 
-    The file is named in one line. It counts if the views show the scene sharp, and either photos
-    that lie there are like renders, or a training wrote its poses in the scene's frame, or
-    ``dataparser_transforms.json`` moves them.
+    The file is named in one line. It counts if the views show the scene sharp, and either a
+    training wrote its poses in the scene's frame, or ``dataparser_transforms.json`` moves them.
+    Nobody asked for it, so no photo that it names is opened.
     """
     for place in camera_files_near(path):
         try:
             found = PosesFile.of(path, place).relative_to(scene.offset)
-            if found.check(scene) or found.named.in_scene_frame or found.transforms is not None:
+            if found.named.in_scene_frame or found.transforms is not None:
+                found.check(scene, photos=False)
                 logger.info("poses: %s; --poses none samples views instead", place)
                 return found
-            why = "no photos beside it tell whether it belongs to the scene"
+            why = f"its frame may be another one; --poses {place} compares its photos and takes it"
         except (DataError, SceneError) as error:
             why = str(error)
         logger.info("%s: not used for views: %s", place, why)
@@ -102,21 +103,19 @@ class PosesFile:
         """The same for a scene whose positions are relative to an offset, scene units."""
         return replace(self, views=self.views.relative_to(offset))
 
-    def check(self, scene: Gaussians) -> bool:
-        """Check by small renders, and by the photos that lie where the file says, that the views
-        belong to a scene, to whose offset they are relative.
-
-        Returns:
-            Whether there were photos.
+    def check(self, scene: Gaussians, photos: bool = True) -> None:
+        """Check by small renders, and, if ``photos``, by the photos that lie where the file says,
+        that the views belong to a scene, to whose offset they are relative.
 
         Raises:
             DataError: if most views show nothing of the scene, or nothing sharp, or renders are not
                 like the photos. A scene without a visible Gaussian is not refused here.
         """
-        photos = self._photos()
-        wrong = pose_faults(scene, self.views).text or likeness(scene, photos).text
+        wrong = pose_faults(scene, self.views).text
+        if not wrong and photos:
+            wrong = likeness(scene, self._photos()).text
         if not wrong:
-            return bool(photos)
+            return
         mend = (
             "nerfstudio moves and scales scenes, and its run says how in "
             "dataparser_transforms.json; put that file beside the scene, or write the scene in the "

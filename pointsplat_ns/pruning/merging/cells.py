@@ -56,7 +56,7 @@ class Scratch:
         known = folder / "work.json"
         try:
             same = known.is_file() and json.loads(read_text(known)) == work
-        except ValueError:
+        except (OSError, ValueError, RecursionError):
             same = False
         try:
             if not same and folder.exists():

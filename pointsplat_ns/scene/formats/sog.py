@@ -106,17 +106,26 @@ def _pixels(images: Images, n: int, part: dict[str, Any], file: int = 0) -> Arra
     return images.pixels(part["files"][file], n).reshape(-1, 4)[:n]
 
 
+def _sh_of(meta: dict[str, Any]) -> dict[str, Any]:
+    """What ``meta.json`` says of SH beyond the constant one; empty if there are none."""
+    part = meta.get("shN") or {}
+    if not isinstance(part, dict):
+        raise ValueError(f"shN is a {type(part).__name__}, expected an object")
+    return part
+
+
 def _rest_of(meta: dict[str, Any]) -> int:
     """SH coefficients per channel beyond the constant one; as many as there can be where only an
     image tells."""
-    bands = meta["shN"].get("bands", MAX_SH_DEGREE) if meta.get("shN") else 0
+    part = _sh_of(meta)
+    bands = part.get("bands", MAX_SH_DEGREE) if part else 0
     if not isinstance(bands, int) or not 0 <= bands <= MAX_SH_DEGREE:
         raise ValueError(f"SH degree {bands!r}, expected 0 to {MAX_SH_DEGREE}")
     return (bands + 1) ** 2 - 1
 
 
 def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
-    part = meta.get("shN")
+    part = _sh_of(meta)
     if not part or part.get("bands") == 0:
         return np.empty((n, 0, 3))
     labels = _pixels(images, n, part, 1)

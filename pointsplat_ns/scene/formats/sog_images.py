@@ -12,6 +12,7 @@ import numpy as np
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.formats.coding import Array
+from pointsplat_ns.scene.image_files import webp_size
 from pointsplat_ns.system.files import require_file, require_memory
 
 SOG_META = "meta.json"
@@ -104,24 +105,6 @@ class Images:
             raise SceneError(f"{self.path}: {name} has {size} bytes; expected at most {most}")
         with part.open("rb") if self._zip is None else self._zip.open(entries[0]) as stream:
             return stream.read(most + 1)  # the size in the archive may be a lie
-
-
-def webp_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a WebP image in pixels, as its header says (RFC 9649); a ValueError if it
-    is none."""
-    kind = data[12:16]
-    head = data[20:30]
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(head) == 10:
-        if kind == b"VP8X":
-            return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
-        if kind == b"VP8L" and head[0] == 0x2F:
-            bits = int.from_bytes(head[1:5], "little")
-            return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-        if kind == b"VP8 ":
-            return int.from_bytes(head[6:8], "little") & 0x3FFF, int.from_bytes(
-                head[8:10], "little"
-            ) & 0x3FFF
-    raise ValueError("not a WebP image")
 
 
 def webp(pixels: Array, width: int, height: int) -> bytes:

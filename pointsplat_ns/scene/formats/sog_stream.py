@@ -246,7 +246,10 @@ def _counts(tree: Any, level: int, names: list[str]) -> Counter[int]:
         if not isinstance(node, dict) or not isinstance(node.get("children", []), list):
             raise ValueError("a node of the tree is no object")
         waiting += node.get("children", [])
-        entry = node.get("lods", {}).get(str(level))
+        lods = node.get("lods", {})
+        if not isinstance(lods, dict):
+            raise ValueError(f"lods of a node are a {type(lods).__name__}, expected an object")
+        entry = lods.get(str(level))
         if entry is None:
             continue
         numbers = [entry[key] for key in ("file", "offset", "count")]

@@ -13,6 +13,7 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.pipeline.options import ViewOptions
 from pointsplat_ns.pipeline.subject import read_subject
+from pointsplat_ns.pipeline.photos import posed_scene
 from posing import inria, nerfstudio, write_photos, write_sparse
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -59,26 +60,39 @@ def test_poses_of_another_frame_are_not_used(scene, views, tmp_path, said):
 
 
 @pytest.mark.parametrize("kind", ["transforms.json", "colmap", "colmap above"])
-def test_poses_of_data_count_where_photos_tell_that_they_belong(kind, scene, views, tmp_path, said):
-    """Their frame is that of the data, which may be another scene's."""
+def test_poses_of_data_count_where_they_are_asked_for_and_no_photo_is_opened_before(
+    kind, scene, views, tmp_path, said, monkeypatch
+):
+    """Their frame is that of the data, which may be another scene's. Photos tell, and are opened
+    for who names the poses."""
     path = tmp_path / ("out/room.ply" if kind == "colmap above" else "room.ply")
     path.parent.mkdir(exist_ok=True)
     ps.save(scene, path)
     if kind == "transforms.json":
-        (tmp_path / kind).write_text(json.dumps(nerfstudio(views)))
+        named = tmp_path / kind
+        named.write_text(json.dumps(nerfstudio(views)))
     else:
-        write_sparse(views, tmp_path / "sparse" / "0")
-    assert (
-        known(path) is None
-        and "no photos beside it tell whether it belongs to the scene" in said.text
-    )
+        named = write_sparse(views, tmp_path / "sparse" / "0")
     write_photos(scene, views, tmp_path / "images")
-    assert same(known(path), views)
-    write_photos(scene, views[torch.arange(len(views)).flip(0).tolist()], tmp_path / "images")
-    assert (
-        known(path) is None
-        and "no more like the photos of their views than like others" in said.text
+    opened = []
+    read = posed_scene.read_reduced
+    monkeypatch.setattr(
+        posed_scene, "read_reduced", lambda *given: opened.append(given) or read(*given)
     )
+    assert known(path) is None and "its frame may be another one; --poses" in said.text
+    assert not opened
+    assert same(known(path, str(named)), views) and len(opened) == len(views)
+    write_photos(scene, views[torch.arange(len(views)).flip(0).tolist()], tmp_path / "images")
+    with pytest.raises(ps.DataError, match="no more like the photos of their views than like"):
+        known(path, str(named))
+
+
+def test_no_photo_is_opened_for_cameras_that_nobody_named(scene, views, tmp_path, monkeypatch):
+    ps.save(scene, tmp_path / "room.ply")
+    (tmp_path / "cameras.json").write_text(json.dumps(inria(views)))
+    write_photos(scene, views, tmp_path)
+    monkeypatch.setattr(posed_scene, "read_reduced", lambda *_: pytest.fail("a photo is opened"))
+    assert same(known(tmp_path / "room.ply"), views)
 
 
 def test_damaged_files_beside_a_scene_stop_nothing(scene, tmp_path, said):
