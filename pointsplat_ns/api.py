@@ -32,6 +32,7 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene, source_file
 from pointsplat_ns.scene.runs import may_be_run, open_run
 from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.outputs import outputs_claimed
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tools.comparison_plots import plot_views as draw_views
@@ -255,6 +256,7 @@ def compact(
 
 
 @normal_mode
+@outputs_claimed()
 def lod(
     scene: Source,
     levels: Sequence[Keep | str] | str = ("50%", "25%", "10%", "3%"),

@@ -172,6 +172,7 @@ def compact(
     from pointsplat_ns.pipeline.requests import Looking, compact_source
     from pointsplat_ns.scene.formats import format_to_write
     from pointsplat_ns.scene.runs import name_of
+    from pointsplat_ns.system.outputs import remove_own, unnamed
 
     options.check_poses(poses)
     if (
@@ -185,7 +186,7 @@ def compact(
         )
     output = output or options.output_beside(scene, goal or "compact", chosen.suffix)
     alone = chosen.page and html is None
-    html = output.with_suffix(".html") if alone else html
+    html = unnamed(output.with_suffix(".html")) if alone else html
     options.check_outputs(output, force, picture, html)
     budget = RepairBudget(effort, seconds)
     suffix = format_to_write(output).suffix
@@ -198,7 +199,7 @@ def compact(
     looking = Looking(poses, resolution, up, data, photos)
     dense, result, source = compact_source(scene, request, looking, progress=True)
     ps.save(result.scene, output, progress=True, overwrite=True)
-    unfinished.unlink(missing_ok=True)
+    remove_own(unfinished)
     quality = quality_of_file(result.judge or judge_of(dense, source), result.scene, output)
     if quality is not None:
         quality = replace(quality, photos=result.photo_gain)
