@@ -234,26 +234,32 @@ def _put_entries(part: Path, target: Path, last: str, force: bool) -> None:
     names = sorted(os.listdir(part), key=lambda name: (name == last, name))
     aside = part / f".{secrets.token_hex(4)}"
     aside.mkdir()
-    undo: list[tuple[Path, Path]] = []
     try:
-        if force and os.path.lexists(target / last):
-            undo.append((aside / last, target / last))
-            os.rename(target / last, aside / last)
+        if force:  # without the last one nobody takes the others for whole
+            _rename_present(target / last, aside / last)
         for name in names:
-            if not force:
+            if force:
+                _rename_present(target / name, aside / name)
+                os.rename(part / name, target / name)
+            else:
                 _put_entry(part / name, target / name)
-                undo.append((target / name, aside / name))
-                continue
-            if os.path.lexists(target / name):
-                undo.append((aside / name, target / name))
-                os.rename(target / name, aside / name)
-            undo.append((target / name, part / name))
-            os.rename(part / name, target / name)
-    except BaseException:
-        for now, before in reversed(undo):
-            with suppress(OSError):  # an interrupted step may not have been taken
-                os.rename(now, before)
+    except BaseException:  # the interrupted step may have been taken or not
+        for name in reversed(names):
+            with suppress(OSError):
+                if not os.path.lexists(part / name):
+                    os.rename(target / name, part / name)
+                elif os.path.samestat(os.lstat(part / name), os.lstat(target / name)):
+                    os.unlink(target / name)
+        for name in os.listdir(aside):
+            with suppress(OSError):
+                os.rename(aside / name, target / name)
         raise
+
+
+def _rename_present(path: Path, other: Path) -> None:
+    """Rename what is there, if anything is."""
+    if os.path.lexists(path):
+        os.rename(path, other)
 
 
 def _put_entry(part: Path, target: Path) -> None:
