@@ -21,6 +21,7 @@ from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene, source_file
 from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.outputs import outputs_claimed
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.quantities import parse_megabytes
 from pointsplat_ns.system.tensors import normal_mode
@@ -302,6 +303,7 @@ def clean(
 
 
 @normal_mode
+@outputs_claimed()
 def lod(
     scene: Source,
     levels: Sequence[Keep | str] | str = ("50%", "25%", "10%", "3%"),

@@ -253,11 +253,18 @@ def _run(args: list[str]) -> None:
         from pointsplat_ns.cli.printing import only_json
         from pointsplat_ns.cli.scene_options import quantities
         from pointsplat_ns.system.memory import keep_freed_memory
+        from pointsplat_ns.system.outputs import outputs_claimed
 
         keep_freed_memory()
         _ignore_matplotlibrc()
         level = logging.DEBUG if "--verbose" in args else logging.INFO
-        with _log_printed(level), _ended_by_signals(), only_json(args), quantities():
+        with (
+            _log_printed(level),
+            _ended_by_signals(),
+            outputs_claimed(),
+            only_json(args),
+            quantities(),
+        ):
             if args == ["--version"]:
                 print(f"pointsplat-ns {__version__}")
             elif args and args[0] in COMMANDS:

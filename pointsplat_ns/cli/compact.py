@@ -114,6 +114,7 @@ def compact(
     from pointsplat_ns.pipeline import run
     from pointsplat_ns.pipeline.quality import quality_of_file
     from pointsplat_ns.scene.formats import format_to_write
+    from pointsplat_ns.system.outputs import remove_own, unnamed
     from pointsplat_ns.tools.wording import log_report, quality_details
 
     options.check_poses(how.poses)
@@ -128,7 +129,7 @@ def compact(
         )
     output = output or options.output_beside(scene, goal or "compact", purpose.suffix)
     alone = purpose.page and html is None
-    html = output.with_suffix(".html") if alone else html
+    html = unnamed(output.with_suffix(".html")) if alone else html
     options.check_outputs(output, force, picture, html)
     refiner = None if how.refiner is None else ps.load_refiner(how.refiner)
     how = replace(how, target_format=format_to_write(output).suffix)
@@ -137,7 +138,7 @@ def compact(
     log_report(done.report)
     report = done.report
     ps.save(report.scene, output, progress=True, overwrite=True)
-    state_file.unlink(missing_ok=True)
+    remove_own(state_file)
     quality = quality_of_file(done.judge, report.scene, output)
     if quality is not None:
         quality = replace(quality, photos=report.photo_gain)

@@ -41,9 +41,9 @@ def convert(
     from pointsplat_ns.pruning import cut_sh
 
     options.need_one_scene(scene)
+    there = output.parent.exists()
     options.check_outputs(output, force)
     start = time.perf_counter()
-    there = output.parent.exists()
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))
     after = ps.place(after, up, scale, scene if original_frame else None)

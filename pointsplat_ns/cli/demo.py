@@ -15,8 +15,9 @@ def demo(output: options.Output = None, force: options.Force = False) -> None:
         output: the file to write, of any format as for prune; by default room.ply in this folder.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.system.outputs import unnamed
 
-    path = output or Path("room.ply")
+    path = output or unnamed(Path("room.ply"))
     scene = ps.example_room()
     options.check_outputs(path, force)
     ps.save(scene, path, overwrite=True)

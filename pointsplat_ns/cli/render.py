@@ -46,11 +46,12 @@ def render(
     options.need_scenes(scene, other)
     import pointsplat_ns as ps
     from pointsplat_ns.system.files import bytes_text
+    from pointsplat_ns.system.outputs import unnamed
 
     start = time.perf_counter()
     options.check_poses(poses)
     beside = options.output_beside(scene, "render", ".mp4")
-    output = output or (
+    output = output or unnamed(
         beside if beside.name == "render.mp4" else beside.with_name(f"{scene.stem}.mp4")
     )
     count = ps.render_path(

@@ -72,17 +72,19 @@ Json = Annotated[
 def output_beside(scene: Path, what: str, suffix: str | None = None) -> Path:
     """The default path of a result, by default in the format of the scene's file. For a file, it is
     beside it: ``room_pruned.ply`` for ``room.ply``. For a run, it is in its folder: ``pruned.ply``;
-    never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint."""
+    never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint.
+    Nobody named it: a symbolic link there is not followed."""
     from pointsplat_ns.scene.formats import format_like
+    from pointsplat_ns.system.outputs import unnamed
 
     name = f"{what}{format_like(scene).suffix if suffix is None else suffix}"
     if scene.is_dir():
-        return scene / name
+        return unnamed(scene / name)
     if scene.absolute().parent.name == "nerfstudio_models":
-        return scene.absolute().parents[1] / name
+        return unnamed(scene.absolute().parents[1] / name)
     if scene.suffix.lower() in (".yml", ".yaml"):
-        return scene.with_name(name)
-    return scene.with_name(f"{scene.stem.removesuffix('.compressed')}_{name}")
+        return unnamed(scene.with_name(name))
+    return unnamed(scene.with_name(f"{scene.stem.removesuffix('.compressed')}_{name}"))
 
 
 def need_scenes(*paths: Path | None) -> None:

@@ -67,7 +67,7 @@ class StoppableTrainerConfig(TrainerConfig):
             )
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
-        with replacing(path) as part:
+        with replacing(path, named=False) as part:
             part.write_text(yaml.dump(self), "utf-8")
 
     def first_step(self) -> int:
@@ -259,7 +259,7 @@ class StoppableTrainer(Trainer):
             content[STATE] = state
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         # Unfinished in the run's folder: nerfstudio takes every file beside checkpoints for one.
-        with replacing(path, tensor_bytes(content), self.base_dir) as part:
+        with replacing(path, tensor_bytes(content), self.base_dir, named=False) as part:
             try:
                 torch.save(content, part)
             except RuntimeError as error:  # what torch makes of a disk that is full after all

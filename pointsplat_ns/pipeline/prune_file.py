@@ -181,9 +181,10 @@ def prune_file(
     )  # 150 bytes for each between rounds
     scratch = Scratch(output.with_name(f".{output.name}.cells"), work, size)
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
-    before, _ = merge_file(
-        rows, count_of, output, most, scratch, views, sampler, progress, jobs=jobs
-    )
+    with scratch.left_if_useful():
+        before, _ = merge_file(
+            rows, count_of, output, most, scratch, views, sampler, progress, jobs=jobs
+        )
     scratch.remove()
     return before, time.perf_counter() - start
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.files import one_line, write_tensors
+from pointsplat_ns.system.outputs import is_own_file
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -22,7 +23,7 @@ class Unfinished:
     """A file with the state after some of the steps of one repair.
 
     Args:
-        path: the file; None for none.
+        path: the file; None for none. Nobody named it: a symbolic link there is not followed.
         scene: K Gaussians before the first step.
         work: all else that the steps depend on; its text tells repairs apart.
     """
@@ -42,7 +43,7 @@ class Unfinished:
     def state(self, like: Mapping[str, Tensor]) -> tuple[int, dict[str, Tensor]] | None:
         """Number of steps and tensors, on the devices of those in ``like``, which have the same
         names, shapes and dtypes; None if there is no file, or it is of another repair."""
-        if self._path is None or not self._path.is_file():
+        if self._path is None or not is_own_file(self._path):
             return None
         from safetensors import SafetensorError, safe_open
 
@@ -71,7 +72,8 @@ class Unfinished:
         if self._path is None or time.monotonic() - self._written < self.SECONDS:
             return
         try:
-            write_tensors(self._path, tensors(), {"repair": self._key, "steps": str(count)})
+            header = {"repair": self._key, "steps": str(count)}
+            write_tensors(self._path, tensors(), header, named=False)
         except (OSError, SceneError) as error:
             logger.warning(
                 "%s: not written (%s); if this is killed, the repair is lost",

@@ -137,13 +137,14 @@ def read_reduced(path: Path, side: int) -> Tensor | None:
     return image[..., :3] * image[..., 3:]
 
 
-def write_picture(picture: Tensor, path: Path) -> None:
+def write_picture(picture: Tensor, path: Path, named: bool = True) -> None:
     """Write an image (H, W, 3), clamped to [0, 1], as a PNG; as a JPEG if the path ends in
-    ``.jpg``. Raises SceneError if it cannot be written."""
+    ``.jpg``; ``named`` as of :func:`~pointsplat_ns.system.files.replacing`. Raises SceneError if it
+    cannot be written."""
     from PIL import Image
 
     image = Image.fromarray((255 * picture.clamp(0, 1)).round().to(torch.uint8).cpu().numpy())
-    with replacing(path) as part:
+    with replacing(path, named=named) as part:
         if path.suffix == ".jpg":
             image.save(part, format="JPEG", quality=90)
         else:

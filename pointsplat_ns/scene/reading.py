@@ -28,6 +28,7 @@ from pointsplat_ns.scene.offsets import warn_if_far
 from pointsplat_ns.scene.runs import RUN_FILES, Run, may_be_run, open_run
 from pointsplat_ns.scene.usable import keep_usable
 from pointsplat_ns.system.files import content_hash, failure_named, logger, require_file
+from pointsplat_ns.system.outputs import claim, outputs_claimed
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
 SCENE_KINDS = (
@@ -163,11 +164,13 @@ def save(
     """
     path = Path(path)
     kind = format_to_write(path)
-    if path.is_file() and not overwrite:
-        raise SceneError(
-            f"{path}: exists already; name another file, or replace it with overwrite=True"
-        )
-    with progress_bar(progress) as report:
+    with outputs_claimed(), progress_bar(progress) as report:
+        if not overwrite:
+            claim(path)
+        if path.is_file() and not overwrite:
+            raise SceneError(
+                f"{path}: exists already; name another file, or replace it with overwrite=True"
+            )
         save_as(kind, scene, path, report)
 
 

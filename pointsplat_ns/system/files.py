@@ -22,6 +22,19 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.system.opening import open_regular
+from pointsplat_ns.system.outputs import (
+    appeared,
+    claim,
+    is_claimed,
+    is_unnamed,
+    make_folders,
+    put_folder,
+    put_new,
+    remove_empty,
+    short_name,
+    temporary_folder,
+    written,
+)
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -110,14 +123,19 @@ def file_stem(text: str) -> str:
 
 @contextmanager
 def replacing(
-    path: Path | str, size: int = 0, folder: Path | None = None, named: bool = True
+    path: Path | str,
+    size: int = 0,
+    folder: Path | None = None,
+    named: bool = True,
+    new: bool = False,
 ) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to. It replaces ``path`` when the block ends
     without an error, else it is removed.
 
-    Missing parent folders are created. Through a symbolic link, its target is written. A file that
-    is replaced keeps its mode. Of several writers of one path, each has a temporary path of its
-    own, and the last one's file stays.
+    Missing parent folders are created, and removed after an error if they are empty. Through a
+    symbolic link, its target is written. A file that is replaced keeps its mode. Of several writers
+    of one path, each has a temporary path of its own, and the last one's file stays. A name that
+    :func:`need_writable` claimed is taken only if it is still free.
 
     Args:
         path: the file.
@@ -125,32 +143,80 @@ def replacing(
         folder: where the temporary path is instead, on the same file system.
         named: whether a person named the file. If not, a symbolic link there is replaced itself:
             somebody else made it, as in a folder that came from elsewhere.
+        new: whether nothing may be replaced, as for a claimed name.
 
     Raises:
-        SceneError: if ``path`` is a folder or a device, or cannot be written.
+        SceneError: if ``path`` is a folder or a device, cannot be written, or may not be replaced.
     """
     path = Path(path)
     part: Path | None = None
+    made: list[Path] = []
+    done = False
+    new = new or is_claimed(path)
     try:
         with failure_named(path, "written"):
-            foreign = not named and path.is_symlink()
-            target = path if foreign else _target_of(path)
-            mode = None if foreign else _mode_of(target)
-            target.parent.mkdir(parents=True, exist_ok=True)
+            foreign = not (named and not is_unnamed(path)) and path.is_symlink()
+            target = path if foreign or new else _target_of(path)
+            mode = None if foreign or new else _mode_of(target)
+            made = make_folders(target.absolute().parent)
             require_space(path, target.parent, size)
-            # No other process or thread has this name, on no machine; file systems allow 255 bytes.
-            start = target.name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
-            part = (folder or target.parent) / f".{start}.{os.getpid()}-{secrets.token_hex(4)}.part"
+            # No other process or thread has this name, on no machine.
+            name = f".{short_name(target)}.{os.getpid()}-{secrets.token_hex(4)}.part"
+            part = (folder or target.parent) / name
             if mode is not None:
                 part.touch(0o600)  # nobody else reads it before it is complete
             yield part
             if mode is not None:
                 part.chmod(mode)
-            os.replace(part, target)
+            if not new:
+                os.replace(part, target)
+                done = True
+                return
+            try:
+                put_new(part, target)
+            except FileExistsError as error:
+                raise appeared(path) from error
+            done = True
+            written(path)
     finally:
         if part is not None:
             with suppress(OSError):  # it may never have been there; the error above says why
                 part.unlink()
+        if not done:
+            remove_empty(made)
+
+
+@contextmanager
+def replacing_folder(
+    folder: Path, last: str, ours: str, force: bool, named: bool = True
+) -> Iterator[Path]:
+    """A temporary folder beside ``folder`` to write to. Its files are in ``folder`` when the block
+    ends without an error: all of them, or, after an error or a signal, those that were there
+    before, see :func:`~pointsplat_ns.system.outputs.put_folder`.
+
+    Args:
+        folder: made if it is missing.
+        last: the file that tells of all others.
+        ours: pattern of the names in ``folder`` that an earlier call wrote.
+        force: whether these may be replaced.
+        named: whether a person named the folder. If not, it may be no symbolic link.
+
+    Raises:
+        SceneError: if the folder cannot be written, or holds what may not be replaced.
+    """
+    folder = Path(folder)
+    need_folder(folder, named)
+    target = Path(os.path.realpath(folder))
+    with failure_named(folder, "written"), temporary_folder(target) as part:
+        try:
+            yield part
+        except SceneError as error:  # of a file that has no name yet
+            raise SceneError(f"{error}".replace(str(part), str(folder))) from error
+        try:
+            put_folder(part, target, last, ours, force)
+        except FileExistsError as error:
+            raise appeared(folder / Path(error.filename).name) from error
+    written(folder)
 
 
 def need_suffix(path: Path, suffix: str) -> None:
@@ -161,8 +227,12 @@ def need_suffix(path: Path, suffix: str) -> None:
 
 
 def need_new(path: Path, force: bool) -> None:
-    """Raise a SceneError if a path exists and may not be replaced."""
-    if _target_of(path).exists() and not force:
+    """Raise a SceneError if a path exists and may not be replaced. Else its name is claimed, see
+    :func:`~pointsplat_ns.system.outputs.claim`, unless it may be replaced."""
+    target = _target_of(path)
+    if not force and not target.exists():
+        claim(path)
+    if not force and target.exists():  # also if another command has just finished it
         raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
 
 
@@ -170,12 +240,18 @@ def need_writable(path: Path, force: bool) -> None:
     """Raise a SceneError if a file cannot be written: it is a folder, a pipe or a device, its
     folder takes none, or it exists and ``force`` does not allow to replace it."""
     with failure_named(path, "written"):
-        need_new(path, force)
         _need_place(path, _target_of(path).absolute().parent)
+        need_new(path, force)
 
 
-def need_folder(path: Path) -> None:
-    """Raise a SceneError if nothing can be written to a folder, which may be missing."""
+def need_folder(path: Path, named: bool = True) -> None:
+    """Raise a SceneError if nothing can be written to a folder, which may be missing, or if it is a
+    symbolic link that nobody ``named``."""
+    if path.is_symlink() and (not named or is_unnamed(path)):
+        raise SceneError(
+            f"{path}: a link to {os.path.realpath(path)}, which the command did not name; remove "
+            "it, or name the folder with --output"
+        )
     if os.path.lexists(path) and not path.is_dir():
         raise SceneError(f"{path}: is a file; expected the name of a folder")
     with failure_named(path, "written"):
@@ -314,14 +390,16 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             )
 
 
-def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:
+def write_tensors(
+    path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str], named: bool = True
+) -> None:
     """Write tensors of any device and a header of metadata to a safetensors file, as
     :func:`replacing` does."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    with replacing(path) as part:
+    with replacing(path, named=named) as part:
         try:
             save_file(contiguous, part, metadata=header)
         except SafetensorError as error:  # for one, of a full disk

@@ -16,6 +16,7 @@ from pointsplat_ns.scene.formats.sog_stream import coarser_levels
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.outputs import outputs_claimed
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.tools.loading import load
 from pointsplat_ns.tools.pages.film import PHOTO_SIDE, FilmSettings, camera_path, render_frames
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger("pointsplat_ns")
 
 
+@outputs_claimed()
 def render_path(
     scene: Source,
     output: str | Path,
@@ -110,7 +112,7 @@ def render_path(
     logger.info("%d x %d pixels: %s", cameras.width, cameras.height, origin)
     frames = render_frames(loaded, cameras, names if len(loaded) > 1 else ())
     return write_frames(
-        tracked(frames, "rendering", len(cameras), progress), Path(output), kind, fps
+        tracked(frames, "rendering", len(cameras), progress), Path(output), kind, fps, force
     )
 
 

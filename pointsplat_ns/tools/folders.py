@@ -49,6 +49,13 @@ from pointsplat_ns.system.files import (
     write_csv,
     write_json,
 )
+from pointsplat_ns.system.outputs import (
+    claim,
+    is_own_file,
+    need_no_links,
+    outputs_claimed,
+    unnamed,
+)
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.system.workers import Workers, check_jobs
@@ -103,6 +110,7 @@ class SceneResult:
 
 
 @normal_mode
+@outputs_claimed()
 def compact_folder(
     folder: str | Path,
     output: str | Path | None = None,
@@ -216,6 +224,8 @@ def compact_folder(
         _Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
         for name, path in find_scenes(folder).items()
     ]
+    if not force:
+        claim(target)
     _describe(target, record, force)
     drawn = (page, sheet) != (None, None)
     work = _Compacting(options, refiner, record, drawn, force)
@@ -245,7 +255,7 @@ def compact_folder(
 def output_folder(folder: Path) -> Path:
     """The default output folder, beside a folder: ``scenes_compact`` for ``scenes``."""
     place = Path(os.path.abspath(folder))
-    return place.with_name(f"{place.name}_compact")
+    return unnamed(place.with_name(f"{place.name}_compact"))
 
 
 _loaded = functools.cache(load_refiner)  # once in each process
@@ -265,6 +275,11 @@ class _Task:
         return SceneResult(self.name, str(self.source), str(self.output), status, **facts)
 
     @property
+    def folder(self) -> Path:
+        """The folder of all results."""
+        return self.output.parents[self.name.count("/")]
+
+    @property
     def record(self) -> Path:
         """The file with the figures and hashes of the result."""
         return self.output.with_name(f"{self.output.name}.json")
@@ -277,7 +292,7 @@ def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
     path = output / FOLDER_FILES.scenes
     text = json_text(options) + "\n"
     try:
-        other = path.exists() and read_text(path) != text
+        other = path.exists() and not path.is_symlink() and read_text(path) != text
     except (OSError, ValueError) as error:
         raise SceneError(
             f"{path}: cannot be read ({one_line(error)}); name another folder for the results"
@@ -307,13 +322,14 @@ class _Compacting:
         try:
             for part in source_parts(task.source):
                 require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
+            need_no_links(task.folder, task.output)
             source = source_file(task.source)
             text = json.dumps([source.sha256, self.record], sort_keys=True)
             key = hashlib.sha256(text.encode()).hexdigest()
             record = _read_record(task)
             whole = (
                 record is not None
-                and task.output.is_file()
+                and is_own_file(task.output)
                 and content_hash(task.output) == record["sha256"]
             )
             if not whole and os.path.lexists(task.output) and not self.force:
@@ -323,7 +339,7 @@ class _Compacting:
                 )
             if record is None or not whole or record["key"] != key:
                 return self._make(task, source.bytes, key, start)
-            if self.drawn and not pair_of(task.output).exists():
+            if self.drawn and not is_own_file(pair_of(task.output)):
                 self._draw(task, read_scene(task.source), read_scene(task.output))
             return _known(task, record)
         except Exception as error:  # one scene must not stop the others
@@ -339,6 +355,7 @@ class _Compacting:
     def _make(self, task: _Task, source_bytes: int, key: str, start: float) -> SceneResult:
         """Write a result and its record. A process killed in between leaves the record alone: the
         scene is open."""
+        new = not self.force and not os.path.lexists(task.output)
         dense = read_scene(task.source)
         kind = format_to_write(task.output)
         options = dataclasses.replace(self.options, target_format=kind.suffix)
@@ -352,8 +369,8 @@ class _Compacting:
         same = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
         same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
         differs = not same or kind.suffix != ".ply"
-        judge = (made.judge or judge_of(dense, views)) if differs else None
-        with replacing(task.output) as part:
+        judge = (made.judge or judge_of(dense, source)) if differs else None
+        with replacing(task.output, named=False, new=new) as part:
             save_as(kind, scene, part, name=task.output)
             written = read_back(scene, part, kind)
             psnr = math.inf if judge is None else judge.psnr(written)[0]
@@ -367,7 +384,8 @@ class _Compacting:
                 seconds=time.perf_counter() - start,
                 note="kept whole" if same else f"no dataset: {views.missing}" * bool(views.missing),
             )
-            for old in (task.output, pair_of(task.output)):  # must not stand beside the new record
+            # These must not stand beside the new record.
+            for old in (pair_of(task.output), *(() if new else (task.output,))):
                 old.unlink(missing_ok=True)
             proofs = {"key": key, "options": self.record, "sha256": content_hash(part)}
             write_json({**dataclasses.asdict(done), **proofs}, task.record)
@@ -385,6 +403,8 @@ class _Compacting:
 
 def _read_record(task: _Task) -> dict[str, Any] | None:
     """The record of a result; None if it is missing or damaged."""
+    if not is_own_file(task.record):
+        return None
     try:
         record = json.loads(read_text(task.record))
         texts = all(isinstance(record[name], str) for name in ("key", "sha256", "note"))

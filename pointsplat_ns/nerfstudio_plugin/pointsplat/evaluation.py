@@ -95,7 +95,8 @@ def evaluate_scene(
                 values[name][metric] += [] if value is None else [float(value)]
         picture = torch.cat(pictures, dim=1)
         if picture_folder is not None:
-            write_picture(picture, picture_folder / f"{scene.name}_{views:04d}.png")
+            name = f"{scene.name}_{views:04d}.png"
+            write_picture(picture, picture_folder / name, named=False)
         views += 1
     if views == 0:
         raise DataError(

@@ -9,8 +9,8 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from pointsplat_ns.system.files import (
     write_json,
     write_tensors,
 )
+from pointsplat_ns.system.outputs import is_own_file
 from pointsplat_ns.system.tensors import INDICES
 
 ROWS_AT_ONCE = 1 << 17
@@ -43,7 +44,8 @@ class Scratch:
     """A folder whose files are complete, or not there.
 
     Args:
-        folder: it is created. If it holds steps of other work, these are removed.
+        folder: it is created. If it holds steps of other work, or a symbolic link, all in it is
+            removed; so is a link in its place.
         work: description of the work, as JSON has it: all that its steps depend on.
         size: bytes of all steps together; they must be free for new work.
 
@@ -55,10 +57,13 @@ class Scratch:
         self.folder = folder
         known = folder / "work.json"
         try:
-            same = known.is_file() and json.loads(read_text(known)) == work
+            same = not folder.is_symlink() and all(map(is_own_file, folder.iterdir()))
+            same = same and json.loads(read_text(known)) == work
         except (OSError, ValueError, RecursionError):
             same = False
         try:
+            if folder.is_symlink():
+                folder.unlink()
             if not same and folder.exists():
                 shutil.rmtree(folder)
             folder.mkdir(parents=True, exist_ok=True)
@@ -67,8 +72,19 @@ class Scratch:
                 f"{folder}: cannot be used ({error.strerror or one_line(error)})"
             ) from error
         if not same:
-            require_space(folder, folder, size)
-            write_json(work, known)
+            with self.left_if_useful():
+                require_space(folder, folder, size)
+                write_json(work, known)
+
+    @contextmanager
+    def left_if_useful(self) -> Iterator[None]:
+        """After an error, remove the folder if no step was taken."""
+        try:
+            yield
+        except BaseException:
+            if not any(path.suffix == ".safetensors" for path in self.folder.glob("[!.]*")):
+                self.remove()
+            raise
 
     def has(self, name: str) -> bool:
         """Whether a step was taken that gave tensors."""

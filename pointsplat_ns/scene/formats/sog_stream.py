@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -27,11 +27,20 @@ from pointsplat_ns.scene.formats.sog import read_sog, sog_parts
 from pointsplat_ns.scene.formats.sog_images import SOG_META
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.usable import usable_part
-from pointsplat_ns.system.files import read_text, replacing, require_file, require_memory
+from pointsplat_ns.system.files import (
+    read_text,
+    replacing,
+    replacing_folder,
+    require_file,
+    require_memory,
+)
 from pointsplat_ns.system.progress import Progress, silent
 
 STREAM_META = "lod-meta.json"
 """The file that tells of all others."""
+
+OWN_FILES = rf"{re.escape(STREAM_META)}|\d+_\d+"
+"""Pattern of the names that are written to the folder of a stream."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +117,17 @@ def stream_parts(path: Path) -> list[Path]:
 
 
 def write_sog_stream(
-    levels: Sequence[Gaussians], tree: Node, path: Path, chunk: int, progress: Progress = silent
+    levels: Sequence[Gaussians],
+    tree: Node,
+    path: Path,
+    chunk: int,
+    progress: Progress = silent,
+    force: bool = True,
 ) -> dict[str, Any]:
     """Write a streamed SOG: all of it, or nothing.
 
-    All files are written beside before the first replaces an older one. Meanwhile there is no
-    ``lod-meta.json``.
+    All files are written beside before the first replaces an older one, see
+    :func:`~pointsplat_ns.system.files.replacing_folder`.
 
     Args:
         levels: the finest first; float32 on the CPU, of Gaussians that can be drawn.
@@ -121,6 +135,7 @@ def write_sog_stream(
         path: the ``lod-meta.json``, in a folder that is created if it is missing.
         chunk: a SOG file is full when it has more Gaussians than this.
         progress: called while encoding.
+        force: whether existing files may be replaced.
 
     Returns:
         The content of ``lod-meta.json``.
@@ -178,21 +193,18 @@ def write_sog_stream(
         "filenames": names,
         "tree": described,
     }
-    with ExitStack() as stack:
-        # Left in the opposite order: lod-meta.json comes last.
-        stack.enter_context(replacing(path)).write_text(
-            json.dumps(meta, separators=(",", ":")), "utf-8"
-        )
+    with replacing_folder(path.parent, path.name, OWN_FILES, force) as beside:
+        (beside / path.name).write_text(json.dumps(meta, separators=(",", ":")), "utf-8")
         for file, (name, (level, rows)) in enumerate(zip(names, files, strict=True)):
 
             def report(what: str, share: float, done: int = file) -> None:
                 progress(f"file {done + 1} of {len(names)}", (done + share) / len(names))
 
             parts = sog_parts(levels[level][torch.cat(rows)], report, ordered=True)
-            for part, data in sorted(parts.items(), key=lambda item: item[0] != SOG_META):
-                part_path = (path.parent / name).with_name(part)
-                stack.enter_context(replacing(part_path, len(data))).write_bytes(data)
-        path.unlink(missing_ok=True)
+            for part, data in parts.items():
+                part_path = (beside / name).with_name(part)
+                with replacing(part_path, len(data)) as place:
+                    place.write_bytes(data)
     return meta
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,10 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.discovery import FOLDER_FILES
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import write_ply
-from pointsplat_ns.system.files import content_hash, replacing, write_json
+from pointsplat_ns.system.files import content_hash, replacing_folder, write_json
+
+OWN_FILES = rf"{re.escape(FOLDER_FILES.levels)}|level_\d+\.ply"
+"""Pattern of the names of files in the folder."""
 
 
 def check_folder(folder: Path, names: Iterable[str], force: bool) -> None:
@@ -38,8 +41,8 @@ def write_levels(
 ) -> None:
     """Write all levels and their manifest, or nothing.
 
-    All files are written beside before the first replaces an older one. Meanwhile there is no
-    manifest, so that a folder with it is whole.
+    All files are written beside before the first replaces an older one, see
+    :func:`~pointsplat_ns.system.files.replacing_folder`.
 
     Args:
         folder: created if it is missing.
@@ -54,26 +57,16 @@ def write_levels(
     folder = Path(folder)
     check_folder(folder, level_names(len(levels)), force)
     rows = []
-    with ExitStack() as stack:
-        stack.callback(_remove_if_empty, folder)  # after an error
-
-        def part_of(name: str) -> Path:
-            return stack.enter_context(replacing(folder / name))
-
-        manifest = part_of(FOLDER_FILES.levels)  # entered first, left last
+    manifest = FOLDER_FILES.levels
+    with replacing_folder(folder, manifest, OWN_FILES, force) as beside:
         for scene, fact, name in zip(levels, facts, level_names(len(levels))[1:], strict=True):
-            part = part_of(name)
+            part = beside / name
             write_ply(scene, part)
             rows.append(
                 {"file": name, "bytes": part.stat().st_size, "sha256": content_hash(part), **fact}
             )
-        write_json({"format": "pointsplat-lod", "version": 2, **about, "levels": rows}, manifest)
-        (folder / FOLDER_FILES.levels).unlink(missing_ok=True)
-
-
-def _remove_if_empty(folder: Path) -> None:
-    with suppress(OSError):
-        folder.rmdir()
+        about = {"format": "pointsplat-lod", "version": 2, **about, "levels": rows}
+        write_json(about, beside / manifest)
 
 
 def level_names(count: int) -> list[str]:

@@ -37,6 +37,7 @@ from pointsplat_ns.scene.reading import SourceFile
 from pointsplat_ns.scene.usable import keep_usable
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.files import need_folder, need_writable
+from pointsplat_ns.system.outputs import claim
 from pointsplat_ns.system.progress import Progress, within
 from pointsplat_ns.tools.levels.errors import pixel_sizes
 from pointsplat_ns.tools.levels.folder import check_folder, level_names, write_levels
@@ -244,8 +245,10 @@ class LevelOutput:
         names = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}[
             self.form
         ]
-        check_folder(self.path, names, self.force)
         need_folder(self.path)
+        if not self.force:
+            claim(self.path)
+        check_folder(self.path, names, self.force)
 
     def write(self, levels: Levels, progress: Progress) -> Levels:
         """Write levels; those of a stream are then judged as they are in its files."""
@@ -257,9 +260,10 @@ class LevelOutput:
         elif self.form == "tiles":
             about, matrix = placed(levels.scenes, levels.dense, self.at, self.up)
             parents = [of.cpu() for of in levels.parents]
-            write_tiles(self.path, about, parents, levels.pixel_sizes(), matrix, progress)
+            sizes = levels.pixel_sizes()
+            write_tiles(self.path, about, parents, sizes, matrix, progress, force=self.force)
         else:
-            write_stream(self.path, levels.scenes, levels.parents, progress)
+            write_stream(self.path, levels.scenes, levels.parents, progress, self.force)
             if levels.judge is not None:
                 read = [
                     levels.judge.quality(read_sog_stream(self.path, index))

@@ -28,12 +28,14 @@ def write_stream(
     levels: Sequence[Gaussians],
     parents: Sequence[Tensor],
     progress: Progress = silent,
+    force: bool = True,
 ) -> list[int]:
-    """Write levels of detail as a streamed SOG, over an older one.
+    """Write levels of detail as a streamed SOG.
 
     Args:
         folder: created if it is missing.
-        levels, parents, progress: as of :func:`~pointsplat_ns.tools.levels.tiles.write_tiles`.
+        levels, parents, progress, force: as of
+            :func:`~pointsplat_ns.tools.levels.tiles.write_tiles`.
 
     Returns:
         The number of Gaussians written of each level.
@@ -45,7 +47,8 @@ def write_stream(
     warn_of_losses(format_to_write(".sog"), scenes[0], folder)
     most = 1 << 19
     tree = partition(scenes, [of.cpu().long() for of in parents], most)
-    return write_sog_stream(scenes, tree, folder / STREAM_META, most, progress)["counts"]
+    path = folder / STREAM_META
+    return write_sog_stream(scenes, tree, path, most, progress, force)["counts"]
 
 
 def partition(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from pointsplat_ns.scene.formats.glb_tile import TILE_EXTENSIONS, encode_tile
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.offsets import from_centre
 from pointsplat_ns.scene.reading import warn_of_losses
-from pointsplat_ns.system.files import replacing
+from pointsplat_ns.system.files import replacing, replacing_folder
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.tools.levels.tree import Cell, cells
@@ -68,12 +68,13 @@ def write_tiles(
     matrix: Tensor,
     progress: Progress = silent,
     most: int = 1 << 16,
+    force: bool = True,
 ) -> list[int]:
     """Write levels of detail as 3D Tiles of glTF with SPZ, which CesiumJS draws: all of them, or
     nothing.
 
-    All files are written beside before the first replaces an older one. Meanwhile there is no
-    ``tileset.json``.
+    All files are written beside before the first replaces an older one, see
+    :func:`~pointsplat_ns.system.files.replacing_folder`.
 
     Args:
         folder: created if it is missing.
@@ -84,6 +85,7 @@ def write_tiles(
         matrix: (4, 4) float64, from the levels' frame to that of the tiles.
         progress: called while encoding.
         most: Gaussians in a tile, but for children of one parent.
+        force: whether existing files may be replaced.
 
     Returns:
         The number of Gaussians written of each level.
@@ -106,14 +108,15 @@ def write_tiles(
         x, y, z = (0.5 * (low + high)).tolist()
         name = f"tiles/{cell.level}_{index}.glb"
         data = encode_tile(scene.at_offset((x, y, z)))
-        stack.enter_context(replacing(folder / name, len(data))).write_bytes(data)
+        with replacing(beside / name, len(data)) as place:
+            place.write_bytes(data)
         counts[cell.level] += len(scene)
         children = [tile(child) for child in cell.children]
         error = errors[cell.level] if children else 0.0
         return {**_node(torch.stack([low, high]), children, error), "content": {"uri": name}}
 
-    with ExitStack() as stack:
-        part = stack.enter_context(replacing(folder / TILESET))  # entered first, left last
+    ours = rf"{re.escape(TILESET)}|tiles"
+    with replacing_folder(folder, TILESET, ours, force) as beside:
         root = _node(None, [tile(top) for top in tops], max(errors))
         root["geometricError"] = max(
             root["geometricError"], 2 * sum(root["boundingVolume"]["box"][3::4])
@@ -128,8 +131,7 @@ def write_tiles(
             "geometricError": root["geometricError"],
             "root": {"transform": matrix.T.flatten().tolist(), "refine": "REPLACE", **root},
         }
-        part.write_text(json.dumps(tileset, separators=(",", ":")), "utf-8")
-        (folder / TILESET).unlink(missing_ok=True)
+        (beside / TILESET).write_text(json.dumps(tileset, separators=(",", ":")), "utf-8")
     return counts
 
 

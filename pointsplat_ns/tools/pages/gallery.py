@@ -18,6 +18,7 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import write_picture
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.files import bytes_text, replacing
+from pointsplat_ns.system.outputs import is_own_file
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.tools.pages.flight import FlightFrame
 from pointsplat_ns.tools.pages.html import page
@@ -39,8 +40,8 @@ def pair_of(output: Path) -> Path:
 
 @torch.no_grad()
 def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Path) -> None:
-    """Draw a scene and a smaller one side by side to a PNG file, in the view that its page opens
-    with; ``known`` are its views, if there are any. Raises DataError if nothing of the scene is
+    """Draw a scene and a smaller one side by side to a PNG file, which nobody named, in the view
+    that its page opens with; ``known`` are its views, if there are any. Raises DataError if nothing of the scene is
     visible, and SceneError if the file cannot be written."""
     frame = FlightFrame.of(before, known)
     views = frame.views.resized(WIDTH)
@@ -51,7 +52,7 @@ def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Pa
     for start, scene in ((left, before), (left + WIDTH, after)):
         drawn = render(in_units(scene, frame.centre.to(scene.device), frame.size), view)
         pair[top : top + view.height, start : start + view.width] = drawn.cpu()
-    write_picture(pair, path)
+    write_picture(pair, path, named=False)
 
 
 def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> None:
@@ -103,11 +104,10 @@ def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
 
 def _pair(result: SceneResult) -> np.ndarray | None:
     """The pair of pictures (H, 2 W, 3) uint8 of a result; None if it is missing or damaged."""
-    return (
-        None
-        if result.megabytes is None
-        else read_png(pair_of(Path(result.output)), 2 * WIDTH, HEIGHT)
-    )
+    path = pair_of(Path(result.output))
+    if result.megabytes is None or not is_own_file(path):
+        return None
+    return read_png(path, 2 * WIDTH, HEIGHT)
 
 
 def _sizes(result: SceneResult) -> tuple[str, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -13,7 +12,14 @@ import numpy as np
 from PIL import Image
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.system.files import need_folder, need_writable, one_line, replacing
+from pointsplat_ns.system.files import (
+    need_folder,
+    need_writable,
+    one_line,
+    replacing,
+    replacing_folder,
+)
+from pointsplat_ns.system.outputs import claim
 
 Kind = Literal["video", "frames", "picture"]
 
@@ -30,6 +36,8 @@ def check_output(output: Path | str, force: bool) -> Kind:
     path = Path(output)
     if path.is_dir() or not path.suffix:
         need_folder(path)
+        if not force:
+            claim(path)
         found = sorted(item.name for item in path.iterdir()) if path.exists() else []
         if others := [name for name in found if not _FRAME.fullmatch(name)]:
             raise SceneError(f"{path}: holds {others[0]}; expected a new folder, or one of frames")
@@ -49,41 +57,29 @@ def check_output(output: Path | str, force: bool) -> Kind:
     return kind
 
 
-def write_frames(frames: Iterable[np.ndarray], path: Path, kind: Kind, fps: float) -> int:
-    """Write all frames, (H, W, 3) uint8 each, or none, over what is there; returns their number.
-    Those of a video have one size, of even width and height; a picture is one frame. Raises
-    SceneError if it cannot be written."""
+def write_frames(
+    frames: Iterable[np.ndarray], path: Path, kind: Kind, fps: float, force: bool = True
+) -> int:
+    """Write all frames, (H, W, 3) uint8 each, or none; returns their number. Those of a video have
+    one size, of even width and height; a picture is one frame. What is there is replaced; a folder
+    with frames only if ``force`` is true. Raises SceneError if it cannot be written."""
     if kind == "video":
         return _write_video(frames, path, fps)
     if kind == "frames":
-        return _write_folder(frames, path)
+        return _write_folder(frames, path, force)
     [pixels] = frames
     with replacing(path) as part:
         Image.fromarray(pixels).save(part, format="PNG")
     return 1
 
 
-def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
-    """Write frames to a temporary folder beside ``folder``, whose frames they replace once all are
-    there."""
-    beside = folder.absolute().parent
-    try:
-        beside.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}.", dir=beside) as part:
-            count = 0
-            for pixels in frames:
-                Image.fromarray(pixels).save(Path(part) / f"frame_{count:05d}.png")
-                count += 1
-            folder.mkdir(exist_ok=True)
-            for old in folder.iterdir():
-                if _FRAME.fullmatch(old.name) and not (Path(part) / old.name).exists():
-                    old.unlink()
-            for new in sorted(Path(part).iterdir()):
-                new.replace(folder / new.name)
-    except OSError as error:
-        raise SceneError(
-            f"{folder}: cannot be written ({error.strerror or one_line(error)})"
-        ) from error
+def _write_folder(frames: Iterable[np.ndarray], folder: Path, force: bool) -> int:
+    """Write frames to a new folder, which then replaces ``folder`` and its frames."""
+    count = 0
+    with replacing_folder(folder, "frame_00000.png", _FRAME.pattern, force) as part:
+        for pixels in frames:
+            Image.fromarray(pixels).save(part / f"frame_{count:05d}.png")
+            count += 1
     return count
 
 

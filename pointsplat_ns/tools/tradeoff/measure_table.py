@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.pipeline.options import ViewOptions
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
@@ -18,7 +18,8 @@ from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import name_of
 from pointsplat_ns.scene.views import spread_indices
-from pointsplat_ns.system.files import bytes_text, need_folder, replacing, three_digits
+from pointsplat_ns.system.files import bytes_text, need_folder, need_new, replacing, three_digits
+from pointsplat_ns.system.outputs import outputs_claimed
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tools.pages.html import page
@@ -40,6 +41,7 @@ from pointsplat_ns.tools.wording import decibels, impression, views_of_size
 
 
 @normal_mode
+@outputs_claimed()
 def measure_tradeoff(
     scene: str | Path,
     folder: str | Path,
@@ -104,11 +106,9 @@ def measure_tradeoff(
     check_options(keep, by, repairs, within, views)
     path = Path(scene)
     folder = Path(folder)
+    for name in RESULTS.values():
+        need_new(folder / name, force)
     with progress_bar(progress) as report:
-        if (folder / RESULTS["json"]).exists() and not force:
-            raise SceneError(
-                f"{folder / RESULTS['json']}: exists already; name another folder, or use --force"
-            )
         report("looking for views", 0.0)
         own = None if photos is None else Path(photos)
         options = ViewOptions(poses=poses, resolution=resolution, up=up, data=data)
@@ -237,7 +237,7 @@ def write_page(found: Tradeoff, pictures: Sequence[dict[str, str]], output: Path
         infinity=math.inf,
         data=data,
     )
-    with replacing(output) as part:
+    with replacing(output, named=False) as part:
         part.write_bytes(html)
 
 

@@ -12,8 +12,8 @@ from making import run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.pipeline.options import ViewOptions
-from pointsplat_ns.pipeline.subject import read_subject
 from pointsplat_ns.pipeline.photos import posed_scene
+from pointsplat_ns.pipeline.subject import read_subject
 from posing import inria, nerfstudio, write_photos, write_sparse
 
 pytestmark = pytest.mark.usefixtures("quick")
