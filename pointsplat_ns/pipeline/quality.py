@@ -22,7 +22,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.pipeline.view_provider import ViewSource
 from pointsplat_ns.prune import ply_bytes
-from pointsplat_ns.render.comparison.closeness import DenseReference, views_text
+from pointsplat_ns.render.comparison.closeness import LEAST_OPACITY, DenseReference, views_text
 from pointsplat_ns.render.comparison.fill import fill
 from pointsplat_ns.render.comparison.sizes import subsampled
 from pointsplat_ns.scene.formats import Format, format_to_write
@@ -95,7 +95,7 @@ class Quality:
     worst: float
     """The same of the worst view, dB."""
     ssim: float | None
-    """SSIM, of which the loss is divided by the share of covered pixels, too; None for pictures
+    """SSIM over the pixels on which the dense scene draws anything, in [-1, 1]; None for pictures
     below its window."""
     views: int
     """Number of views."""
@@ -111,14 +111,21 @@ class Quality:
     """The same of the scene."""
     photos: PhotoGain | None = None
     """What photos say, if the scene was trained on some."""
+    opacity: float = 1.0
+    """Mean opacity of the dense scene, in [0, 1], where it draws anything."""
 
     def __str__(self) -> str:
         line = quality_line(self.psnr, self.ssim)
-        if self.photos is None:
-            return line
-        if not self.photos.kept:
-            return f"{self.photos}; {line}"
-        return f"{self.photos}; {line.partition(': ')[0]} against the dense scene"
+        if self.photos is not None and self.photos.kept:
+            line = f"{self.photos}; {line.partition(': ')[0]} against the dense scene"
+        elif self.photos is not None:
+            line = f"{self.photos}; {line}"
+        if self.opacity < LEAST_OPACITY:
+            line += (
+                "; the dense scene is translucent from everywhere (mean opacity "
+                f"{100 * self.opacity:.0f} %), as it is just behind an opacity reset"
+            )
+        return line
 
     @property
     def details(self) -> str:
@@ -201,10 +208,19 @@ class Judge:
         (psnr, worst) = self.psnr(scene)
         similarity = None
         if self._bands is not None:
-            covered = sum(self._bands.covered) / len(self._bands.covered)
-            similarity = 1 - (1 - self._bands.ssim(self._placed(scene))) / (covered or 1.0)
-        views = (len(self.views), self.views.width, self.views.height, self.origin)
-        return Quality(psnr, worst, similarity, *views, self._fill, fill(scene, self.views))
+            similarity = self._bands.ssim(self._placed(scene))
+        return Quality(
+            psnr=psnr,
+            worst=worst,
+            ssim=similarity,
+            views=len(self.views),
+            width=self.views.width,
+            height=self.views.height,
+            origin=self.origin,
+            fill_before=self._fill,
+            fill=fill(scene, self.views),
+            opacity=self._pixels.opacity,
+        )
 
     @cached_property
     def _fill(self) -> float:

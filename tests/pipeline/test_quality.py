@@ -5,8 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from making import box_room
+import pointsplat_ns as ps
+from making import box_room, cloud
 from pointsplat_ns.pipeline.quality import (
     Judge,
     PhotoGain,
@@ -16,9 +20,11 @@ from pointsplat_ns.pipeline.quality import (
     through_file,
 )
 from pointsplat_ns.pipeline.view_provider import ViewSource
+from pointsplat_ns.render import render
 from pointsplat_ns.render.comparison.closeness import DenseReference
 from pointsplat_ns.render.comparison.fill import fill
 from pointsplat_ns.scene.reading import save
+from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.sampler import sample_views
 
 SOME = Quality(28.84, 24.2, 0.9132, 12, 1920, 1080, "given views", 33.84, 12.06)
@@ -35,9 +41,7 @@ def test_the_figures_are_those_of_whole_pictures_over_covered_pixels(dense):
     found = Judge(dense, ViewSource(dense, views)).quality(small)
     whole = DenseReference(dense, views)
     assert (found.psnr, found.worst) == whole.psnr(small)
-    assert found.ssim == pytest.approx(
-        1 - (1 - whole.ssim(small)) / (sum(whole.covered) / 3), abs=1e-6
-    )
+    assert found.ssim == pytest.approx(whole.ssim(small), abs=1e-6)
     assert (found.fill_before, found.fill) == (fill(dense, views), fill(small, views))
 
 
@@ -47,9 +51,7 @@ def test_few_pixels_of_large_pictures_stand_for_all(dense):
     found = Judge(dense, ViewSource(dense, views)).quality(small)
     whole = DenseReference(dense, views)
     assert found.psnr == pytest.approx(whole.psnr(small)[0], abs=0.1)
-    assert found.ssim == pytest.approx(
-        1 - (1 - whole.ssim(small)) / (sum(whole.covered) / 4), abs=0.05
-    )
+    assert found.ssim == pytest.approx(whole.ssim(small), abs=0.05)
     assert (found.views, found.width, found.height) == (4, 960, 720)
 
 
@@ -92,3 +94,61 @@ def test_photos_lead_where_they_were_trained_on():
 def test_where_nothing_is_visible_nothing_is_judged(dense):
     unseen = dense.replace(opacities=dense.opacities - 100)
     assert quality_of_file(judge_of(unseen, ViewSource(unseen)), unseen, Path("unseen.ply")) is None
+
+
+def test_a_scene_that_is_translucent_from_everywhere_is_said_to_be(dense):
+    views = sample_views(dense, 3, 64, 48)
+    reset = dense.replace(opacities=torch.full_like(dense.opacities, -5.0))
+    found = Judge(reset, ViewSource(reset, views)).quality(reset[::3])
+    assert 0 < found.opacity < 0.5 and "translucent from everywhere (mean opacity " in str(found)
+    opaque = Judge(dense, ViewSource(dense, views)).quality(dense[::3])
+    assert opaque.opacity > 0.5 and "translucent" not in str(opaque)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    opacity=st.floats(-8, 10),
+    other=st.floats(-8, 10),
+    distance=st.floats(0.5, 300),
+    shift=st.floats(-3, 3),
+    seed=st.integers(0, 9),
+)
+def test_ssim_and_psnr_stay_in_their_range_at_any_coverage(opacity, other, distance, shift, seed):
+    """From a scene that fills the picture to one that is a faint dot, against one that is moved,
+    and as opaque or as faint."""
+    scene = cloud(30, seed=seed)
+    dense = scene.replace(opacities=torch.full_like(scene.opacities, opacity))
+    beside = scene.replace(
+        means=scene.means + shift, opacities=torch.full_like(scene.opacities, other)
+    )
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.tensor([-0.5, -0.5, distance])
+    K = torch.tensor([[40.0, 0.0, 12.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]])
+    views = Views(viewmat[None], K[None], 24, 24, torch.zeros(3))
+    for judged in (beside, dense):
+        found = Judge(dense, ViewSource(dense, views)).quality(judged)
+        assert -1 <= found.ssim <= 1 and 0 <= found.opacity <= 1
+        assert math.isfinite(found.psnr) or found.psnr == math.inf
+        assert found.psnr > -40  # 576 pixels: one covered pixel, and an error of all others
+    assert found.psnr == math.inf and found.ssim == 1
+
+
+def test_a_translucent_scene_is_judged_as_its_pictures_differ():
+    """Behind an opacity reset, errors are not divided by the little that is opaque."""
+    scene = cloud(400)
+    dense = scene.replace(opacities=torch.full_like(scene.opacities, -4.5))
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.tensor([-0.5, -0.5, 1.2])
+    K = torch.tensor([[96.0, 0.0, 32.0], [0.0, 96.0, 32.0], [0.0, 0.0, 1.0]])
+    views = Views(viewmat[None], K[None], 64, 64, torch.zeros(3))
+    reference = DenseReference(dense, views)
+    image = render(dense[:40], views[0])
+    plain = float(ps.ssim(image, reference.renders[0]))
+    assert reference.drawn[0] > 0.9 and reference.opacity < 0.5
+    assert reference.ssim(dense[:40]) == pytest.approx(
+        1 - (1 - plain) / reference.drawn[0], abs=1e-4
+    )
+    error = float((image - reference.renders[0]).square().mean())
+    assert reference.psnr(dense[:40])[0] == pytest.approx(
+        -10 * math.log10(error / (0.5 * reference.drawn[0])), abs=1e-3
+    )
