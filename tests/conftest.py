@@ -158,7 +158,7 @@ def make_refined_run() -> Callable:
     ) -> Path:
         config = small_config(data, folder, 10, **model)
         config.pipeline.datamanager.eval_scenes = eval_scenes
-        config.save_config()
+        config.write_config()
         torch.manual_seed(SEED)
         refiner = Refiner(preset("tiny"))
         with torch.no_grad():

@@ -4,6 +4,7 @@ are not finite."""
 from __future__ import annotations
 
 import functools
+import shutil
 import signal
 import sys
 import threading
@@ -11,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, NoReturn
 
@@ -23,11 +25,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from tyro.conf import Fixed, Suppress
 
-from pointsplat_ns.errors import DataError, PointSplatError
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
 from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
-from pointsplat_ns.scene.checkpoints import load_checkpoint
-from pointsplat_ns.scene.runs import step_of
+from pointsplat_ns.nerfstudio_plugin.option_checks import check_options
+from pointsplat_ns.scene.checkpoints import read_training_state
+from pointsplat_ns.scene.runs import RUN_FILES, step_of
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.files import one_line, replacing
 from pointsplat_ns.system.memory import keep_freed_memory
@@ -57,30 +60,70 @@ class StoppableTrainerConfig(TrainerConfig):
     gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
     log_gradients: Suppress[Fixed[bool]] = False
 
-    def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all. Raises PointSplatError if it cannot be written,
-        or no step is asked for."""
+    def set_timestamp(self) -> None:
+        """As nerfstudio's. It is the first that ``ns-train`` calls, so all options are checked
+        here, before anything is written."""
+        self.check()
+        super().set_timestamp()
+
+    def check(self) -> None:
+        """Raise PointSplatError for options that no training can have."""
         if self.max_num_iterations < 1:
             raise PointSplatError(
                 f"--max-num-iterations {self.max_num_iterations}: expected at least 1; a run is "
                 "shown and measured without a training by ns-viewer, ns-render and ns-eval"
             )
-        path = self.get_base_dir() / "config.yml"
-        CONSOLE.log(f"Saving config to: {path}")
-        with replacing(path, named=False) as part:
-            part.write_text(yaml.dump(self), "utf-8")
+        check_options(self)
+
+    def save_config(self) -> None:
+        """Write nothing yet: the trainer does, once scenes and checkpoints are loaded, so that a
+        command that fails leaves no folder of a run (:meth:`write_config`)."""
+
+    def write_config(self) -> None:
+        """Write ``config.yml``, whole or not at all, by the first process. Raises PointSplatError
+        if it cannot be written."""
+        path = self.get_base_dir() / RUN_FILES.config
+
+        def write() -> None:
+            CONSOLE.log(f"Saving config to: {path}")
+            with replacing(path, named=False) as part:
+                part.write_text(yaml.dump(self), "utf-8")
+
+        processes.by_first(write)
+
+    def trainer(self, fitted: Any, **kwargs: Any) -> Trainer:
+        """The trainer of a copy of this config, fitted to the training; what it saves as
+        ``config.yml`` is this one."""
+        self.check()
+        trainer = self._target(fitted, **kwargs)
+        trainer.given_config = self
+        return trainer
 
     def first_step(self) -> int:
         """The step that a training begins with: 0, or the step in the name of the checkpoint that
         it resumes from."""
-        if self.load_dir is not None and self.load_step is not None:
-            return self.load_step + 1
-        paths = (
-            [self.load_checkpoint] if self.load_dir is None else self.load_dir.glob("step-*.ckpt")
-        )
-        return max(
-            (step + 1 for path in paths if path and (step := step_of(path)) is not None), default=0
-        )
+        path = self.checkpoint_to_load()
+        step = None if path is None else step_of(path)
+        return 0 if step is None else step + 1
+
+    def checkpoint_to_load(self) -> Path | None:
+        """The checkpoint that a training goes on from; None if it begins anew. Raises SceneError if
+        there is no such file."""
+        folder = self.load_dir
+        if folder is None:
+            path = self.load_checkpoint
+            if path is not None and not path.is_file():
+                raise SceneError(f"--load-checkpoint {path}: no such file; expected step-N.ckpt")
+            return path
+        steps = {
+            step: path for path in folder.glob("step-*.ckpt") if (step := step_of(path)) is not None
+        }
+        wanted = max(steps, default=None) if self.load_step is None else self.load_step
+        if wanted not in steps:
+            found = ", ".join(map(str, sorted(steps))) or "none"
+            what = "a run's nerfstudio_models" if wanted is None else f"step {wanted}"
+            raise SceneError(f"--load-dir {folder}: expected checkpoints of {what}; found {found}")
+        return steps[wanted]
 
 
 class StoppableTrainer(Trainer):
@@ -98,6 +141,10 @@ class StoppableTrainer(Trainer):
     """
 
     config: StoppableTrainerConfig
+    given_config: StoppableTrainerConfig | None = None
+    """The config that is saved: as given, before it was fitted to the training."""
+    _own_folder = False
+    """Whether the run's folder was not there before."""
     _asked: int | None = None
     """Number of the signal that asked it to stop."""
     _between_steps = False
@@ -108,13 +155,17 @@ class StoppableTrainer(Trainer):
         self.skipped: Counter[str] = Counter()
         """Number of steps that were skipped, by photo or scene, over all processes."""
         self._skipped_in_a_row = 0
+        self._own_folder = not self.base_dir.exists()
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio's; a line of the log names the rasterizer."""
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
-            super().setup(test_mode)
+            with self._no_folder_of_nothing():
+                super().setup(test_mode)
+                if self.given_config is not None:
+                    self.given_config.write_config()
             model = self.config.pipeline.model
             if self.local_rank == 0 and isinstance(model, RasterizerOptions):
                 CONSOLE.log(model.engine(torch.device(self.device)))
@@ -125,22 +176,13 @@ class StoppableTrainer(Trainer):
             # resumes from a later one.
             writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
 
-    def _load_checkpoint(self) -> None:
-        """As nerfstudio's. Raises SceneError, before anything is loaded, if the checkpoint to
-        resume from is damaged, or asks for more memory than it has bytes."""
-        path = self.config.load_checkpoint
-        if self.config.load_dir is not None:
-            path = self.config.load_dir / f"step-{self.config.first_step() - 1:09d}.ckpt"
-        if path is not None and path.exists():  # of one that is missing nerfstudio says so
-            load_checkpoint(path)
-        super()._load_checkpoint()
-
     def train(self) -> None:
         """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130.
         nerfstudio saves none and ends with 0, as if it had finished."""
         with fixed_threads(self.config.threads), self._signals_noted():
             try:
-                super().train()
+                with self._no_folder_of_nothing():
+                    super().train()
             except KeyboardInterrupt:
                 if self._between_steps and self.step > self._start_step:
                     self.save_checkpoint(self.step - 1)
@@ -149,6 +191,52 @@ class StoppableTrainer(Trainer):
                         f"--load-dir {self.checkpoint_dir}"
                     )
                 _interrupted(self._asked or signal.SIGINT)
+
+    @contextmanager
+    def _no_folder_of_nothing(self) -> Iterator[None]:
+        """If an error ends this before a step is done, remove the run's folder, unless it was there
+        before."""
+        try:
+            yield
+        except BaseException:
+            if self._own_folder and self.local_rank == 0 and self.step <= self._start_step:
+                for kind in [kind for kind in writer.EVENT_WRITERS if hasattr(kind, "tb_writer")]:
+                    kind.tb_writer.close()
+                    writer.EVENT_WRITERS.remove(kind)
+                shutil.rmtree(self.base_dir, ignore_errors=True)
+                for above in self.base_dir.parents[:3]:  # METHOD, EXPERIMENT, the output folder
+                    with suppress(OSError):  # not empty
+                        above.rmdir()
+            raise
+
+    def _load_checkpoint(self) -> None:
+        """As nerfstudio's. Raises SceneError if the checkpoint is missing, truncated, or of another
+        method or other settings."""
+        path = self.config.checkpoint_to_load()
+        if path is None:
+            return
+        content = read_training_state(path)
+        try:
+            self.pipeline.load_pipeline(content["pipeline"], content["step"])
+            self.optimizers.load_optimizers(content["optimizers"])
+            if "schedulers" in content and self.config.load_scheduler:
+                self.optimizers.load_schedulers(content["schedulers"])
+            self.grad_scaler.load_state_dict(content["scalers"])
+            self._start_step = content["step"] + 1
+            self.put_back(content.get(STATE))
+        except PointSplatError:
+            raise
+        except Exception as error:  # the file's content can be anything
+            raise SceneError(
+                f"{path}: no training of {self.config.method_name} can go on from it "
+                f"({type(error).__name__}: {one_line(error, 160)}); expected a checkpoint of the "
+                "same method and settings"
+            ) from error
+        self.step = self._start_step
+        CONSOLE.log(f"going on after step {content['step']} of {path}")
+
+    def put_back(self, state: Any) -> None:
+        """Put back :meth:`state_to_resume`; None if the checkpoint has none."""
 
     def _train_complete_viewer(self) -> None:
         """Keep the viewer open after the last step until Ctrl-C or SIGTERM, once: the training is

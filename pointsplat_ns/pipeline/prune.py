@@ -67,7 +67,7 @@ def prune_scene(
     a compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met,
     SceneError if no Gaussian of the scene can be drawn, and DataError if views are needed and there
     are none."""
-    options.check()
+    ReductionOptions.check(options)
     need_usable(dense)
     views = views or ViewProvider(dense)
     full, sh_cut = _with_sh(dense, options.sh, views, progress)

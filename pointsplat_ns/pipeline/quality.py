@@ -73,7 +73,7 @@ class Quality:
     worst: float
     """The same of the worst view, dB."""
     ssim: float | None
-    """SSIM, of which the loss is divided by the share of covered pixels, too; None for pictures
+    """SSIM over the pixels on which the dense scene draws anything, in [-1, 1]; None for pictures
     below its window."""
     views: int
     """Number of views."""
@@ -89,6 +89,8 @@ class Quality:
     """The same of the scene."""
     photos: PhotoGain | None = None
     """What photos say, if the scene was trained on some."""
+    opacity: float = 1.0
+    """Mean opacity of the dense scene, in [0, 1], where it draws anything."""
 
 
 class Judge:
@@ -140,8 +142,7 @@ class Judge:
         psnr, worst = self.psnr(scene)
         similarity = None
         if self._bands is not None:
-            covered = sum(self._bands.covered) / len(self._bands.covered)
-            similarity = 1 - (1 - self._bands.ssim(self._placed(scene))) / (covered or 1.0)
+            similarity = self._bands.ssim(self._placed(scene))
         return Quality(
             psnr=psnr,
             worst=worst,
@@ -152,6 +153,7 @@ class Judge:
             origin=self.origin,
             fill_before=self._fill,
             fill=fill(scene, self.views),
+            opacity=self._pixels.opacity,
         )
 
     @cached_property

@@ -156,6 +156,27 @@ def read_photo_fit(path: Path | str) -> PhotoFit:
     return PhotoFit(adjustments, colors)
 
 
+def read_training_state(path: Path) -> dict[str, Any]:
+    """All that a checkpoint of a nerfstudio training holds, to resume from it; its tensors are not
+    mapped. Loads as :func:`read_checkpoint`.
+
+    Raises:
+        SceneError: if the file is truncated, or lacks the step, the pipeline or the optimisers.
+    """
+    expected = "expected a checkpoint of a nerfstudio training"
+    content = load_checkpoint(path, mapped=False)
+    found = _some(content, 6) if isinstance(content, dict) else type(content).__name__
+    needed = {"step": int, "pipeline": dict, "optimizers": dict, "scalers": dict}
+    for name, kind in needed.items():
+        if not isinstance(content, dict) or not isinstance(content.get(name), kind):
+            raise SceneError(
+                f"{path}: no training can go on from it; lacks {name!r}; found {found}; {expected}"
+            )
+    if content["step"] < 0:
+        raise SceneError(f"{path}: its step is {content['step']}; {expected}")
+    return content
+
+
 def is_complete(path: Path) -> bool:
     """Whether a checkpoint's archive is complete, that is, has the directory at its end."""
     try:
@@ -182,9 +203,9 @@ def allow_splatfacto_checkpoints() -> None:
     torch.serialization.add_safe_globals([entry for entry in allowed if entry not in present])
 
 
-def load_checkpoint(path: Path) -> Any:
-    """What a checkpoint holds, with its tensors memory-mapped if it is an archive. Nothing of it is
-    run, and it takes memory in proportion to its size.
+def load_checkpoint(path: Path, mapped: bool = True) -> Any:
+    """What a checkpoint holds, with its tensors memory-mapped if it is an archive and ``mapped``.
+    Nothing of it is run, and it takes memory in proportion to its size.
 
     Raises:
         SceneError: if it is no checkpoint, damaged, or asks for more.
@@ -201,7 +222,7 @@ def load_checkpoint(path: Path) -> Any:
                     f"{path}: truncated, the archive has no end; {EXPECTED}; train or copy it again"
                 )
         need_bounded(path)
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=archive)
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=archive and mapped)
     except SceneError:
         raise
     except Exception as error:  # a damaged pickle can raise nearly anything

@@ -32,6 +32,9 @@ THREADS_VARIABLE = "OMP_NUM_THREADS"
 """Environment variable with the number of torch's threads. Where it is set, more are used than
 there are cores."""
 
+MOST_THREADS = 1024
+"""The system does not start any number of threads."""
+
 
 class Own(threading.local):
     """What :func:`one_thread_each` found in one thread of Python."""
@@ -142,8 +145,8 @@ def fixed_threads(count: int | None) -> Iterator[None]:
     if count is None:
         yield
         return
-    if not 1 <= count <= 1024:
-        raise PointSplatError(f"{count} threads; expected 1 to 1024")
+    if not 1 <= count <= MOST_THREADS:
+        raise PointSplatError(f"{count} threads; expected 1 to {MOST_THREADS}")
     before = torch.get_num_threads()
     variable = os.environ.get(THREADS_VARIABLE)
     torch.set_num_threads(count)

@@ -369,7 +369,7 @@ class _Compacting:
         same = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
         same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
         differs = not same or kind.suffix != ".ply"
-        judge = (made.judge or judge_of(dense, source)) if differs else None
+        judge = (made.judge or judge_of(dense, views)) if differs else None
         with replacing(task.output, named=False, new=new) as part:
             save_as(kind, scene, part, name=task.output)
             written = read_back(scene, part, kind)

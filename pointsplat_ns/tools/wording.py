@@ -21,7 +21,7 @@ from pointsplat_ns.pipeline.report import (
     TargetSearch,
 )
 from pointsplat_ns.pipeline.view_provider import Origin, ViewOrigin
-from pointsplat_ns.rendering.comparison.closeness import Closeness
+from pointsplat_ns.rendering.comparison.closeness import LEAST_OPACITY, Closeness
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.system.quantities import counted
@@ -69,13 +69,18 @@ def photo_gain_text(gain: PhotoGain) -> str:
 def quality_text(quality: Quality) -> str:
     """The line that users read of a result."""
     line = quality_line(quality.psnr, quality.ssim)
-    if quality.photos is None:
-        return line
-    gain = photo_gain_text(quality.photos)
-    if not quality.photos.accepted:
-        return f"{gain}; {line}"
-    similarity = "" if quality.ssim is None else f", SSIM {quality.ssim:.2f}"
-    return f"{gain}; {decibels(quality.psnr)}{similarity} against the dense scene"
+    if quality.photos is not None:
+        gain = photo_gain_text(quality.photos)
+        similarity = "" if quality.ssim is None else f", SSIM {quality.ssim:.2f}"
+        if quality.photos.accepted:
+            line = f"{decibels(quality.psnr)}{similarity} against the dense scene"
+        line = f"{gain}; {line}"
+    if quality.opacity < LEAST_OPACITY:
+        line += (
+            "; the dense scene is translucent from everywhere (mean opacity "
+            f"{100 * quality.opacity:.0f} %), as it is just behind an opacity reset"
+        )
+    return line
 
 
 def quality_lines(quality: Quality) -> tuple[str, ...]:
@@ -124,6 +129,7 @@ def quality_json(quality: Quality | None) -> dict[str, Any]:
         "fill_before": quality.fill_before,
         "fill": quality.fill,
         "photos": photos,
+        "opacity": quality.opacity,
         "quality": quality_text(quality),
     }
 

@@ -15,6 +15,7 @@ from pointsplat_ns.pipeline import cleaning
 from pointsplat_ns.pipeline.cleaning import (
     FLOATING,
     PLACES,
+    Rule,
     clean_scene,
     find_junk,
     floating_scores,
@@ -94,7 +95,7 @@ def test_nothing_of_a_clean_room_is_touched():
     assert junk_of(thin) == ([], [])
     result = prune_scene(thin, PruneOptions(0.4, "opacity", clean=True))
     assert same_bits(result.scene, prune_scene(thin, PruneOptions(0.4, "opacity")).scene)
-    assert result.notes == ("clean: nothing removed",)
+    assert result.cleaning is not None and result.cleaning.effects == ()
 
 
 @pytest.mark.parametrize("kind", JUNK)
@@ -167,9 +168,9 @@ def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
     scene = with_junk(box_room(0, 40, size=0.05))
     junk = find_junk(scene)
     assert junk.places == 0 and len(junk.unseen) == 0
-    (first, second) = clean_scene(scene, 1, ViewProvider(scene)).notes
-    assert first == f"clean: 2 of {len(scene)} removed that cannot be drawn"
-    assert second.endswith("(nothing to look from was found)")
+    undrawable, unseen = clean_scene(scene, 1, ViewProvider(scene)).effects
+    assert (undrawable.rule, undrawable.removed) == (Rule.UNDRAWABLE, 2)
+    assert (unseen.rule, unseen.removed, unseen.places) == (Rule.UNSEEN, 0, 0)
 
 
 def before_a_wall(unit: float = 1.0) -> tuple[Gaussians, Views]:
@@ -211,9 +212,9 @@ def test_what_a_given_view_shows_is_not_unseen(room):
         for source in (ViewProvider(scene, given=behind), ViewProvider(scene))
     ]
     assert [near & {*cleaning.junk.unseen.tolist()} for cleaning in cleanings] == [set(), near]
-    assert not any(
-        len(cleaning.junk.floating) or "float" in str(cleaning.notes) for cleaning in cleanings
-    )
+    assert not any(len(cleaning.junk.floating) for cleaning in cleanings)
+    rules = {effect.rule for cleaning in cleanings for effect in cleaning.effects}
+    assert rules == {Rule.UNSEEN}
 
 
 def test_the_score_is_its_formula():

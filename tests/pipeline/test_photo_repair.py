@@ -252,7 +252,7 @@ def test_masked_pixels_neither_pull_nor_count(hollow_ball, pruned, photos):
 def test_a_run_is_compacted_with_its_photos(trained_walls):
     (config,) = (trained_walls / "wall-a").rglob("config.yml")
     result = ps.compact(config.parent, "50%", effort="quick", photos=True)
-    assert result.stages[-1].name == "photos" and result.photo_gain.after > 5
+    assert result.stages[-1].stage == "photos" and result.photo_gain.after > 5
 
 
 def test_halves_lie_on_both_sides_along_the_longest_axis(hollow_ball):

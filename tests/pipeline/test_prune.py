@@ -7,6 +7,7 @@ import pytest
 from making import ball, same
 from pointsplat_ns.pipeline.options import PruneOptions
 from pointsplat_ns.pipeline.prune import Pruned, prune_scene
+from pointsplat_ns.pipeline.report import ShCut
 from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import METHODS, Keep, WithinPsnr, select
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
@@ -76,4 +77,4 @@ def test_auto_sh_keeps_bands_that_are_seen_and_drops_those_that_are_not(scene, v
     strong = scene.replace(features_rest=scene.features_rest * 10)
     result = pruned(strong, views, 1.0, "paper", sh="auto")
     assert result.scene.sh_degree == 1
-    assert result.notes == ("views: given views", "SH degree 1 kept")
+    assert result.sh == ShCut(before=1, after=1)

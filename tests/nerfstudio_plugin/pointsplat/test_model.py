@@ -118,7 +118,7 @@ def test_contradictory_settings_are_refused(trained_walls, tmp_path, changes, me
     config = small_config(trained_walls, tmp_path / "outputs", 1)
     for name, value in changes.items():
         setattr(config if hasattr(config, name) else config.pipeline.model, name, value)
-    config.save_config()
+    config.write_config()
     with pytest.raises(PointSplatError, match=message):
         config.setup(local_rank=0, world_size=1).setup()
 

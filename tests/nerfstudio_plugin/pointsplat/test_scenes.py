@@ -38,7 +38,7 @@ def manager_of(folder: Path, **settings):
 def run(tmp_path, wall_config, wall_scene) -> Path:
     """A run folder as nerfstudio lays it out, with an empty checkpoint."""
     config = wall_config(wall_scene, tmp_path, steps=1)
-    config.save_config()
+    config.write_config()
     config.get_checkpoint_dir().mkdir()
     torch.save({"step": 0, "pipeline": {}}, config.get_checkpoint_dir() / "step-000000000.ckpt")
     return config.get_base_dir()

@@ -113,7 +113,7 @@ def test_no_steps_are_refused_and_leave_no_folder(number, wall_scene, wall_confi
         with pytest.raises(
             PointSplatError, match=f"--max-num-iterations {number}: expected at least 1"
         ):
-            config.save_config()
+            config.set_timestamp()
         assert not config.output_dir.exists()
 
 
