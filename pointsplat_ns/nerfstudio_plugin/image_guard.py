@@ -39,7 +39,7 @@ def photos_alone() -> Iterator[None]:
                 ) from error
         return usual(fp, mode, IMAGE_FORMATS if formats is None else formats)
 
-    Image.open = guarded
+    Image.open = guarded  # type: ignore[assignment]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)

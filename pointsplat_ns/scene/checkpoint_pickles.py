@@ -145,7 +145,7 @@ class _Follower:
     def follow(self) -> Any:
         """The value of the next pickle: a number, text or a stand-in. Raises PickleRefused."""
         stack: list[Any] = []
-        memo: dict[int, Any] = {}
+        memo: dict[Any, Any] = {}
         try:
             for opcode, argument, _ in pickletools.genops(self._stream):
                 name = opcode.name
