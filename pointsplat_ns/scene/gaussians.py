@@ -103,7 +103,8 @@ class Gaussians:
 
     Raises:
         SceneError: if a parameter is no tensor, a shape, device or dtype does not fit the others,
-            no SH degree has this number of coefficients, ``up`` is no axis, or ``offset`` is not three finite numbers.
+            no SH degree has this number of coefficients, ``up`` is no axis, or ``offset`` is not
+            three finite numbers.
 
     Example:
         Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside

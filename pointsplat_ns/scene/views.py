@@ -85,13 +85,19 @@ class Views:
     eps2d: float = EPS2D  # pixels^2
 
     def __post_init__(self) -> None:
-        count = self.viewmats.shape[0] if self.viewmats.dim() else 0
+        tensors = isinstance(self.viewmats, Tensor) and self.viewmats.dim() > 0
+        count = self.viewmats.shape[0] if tensors else 0
         for name, shape in (
             ("viewmats", (count, 4, 4)),
             ("Ks", (count, 3, 3)),
             ("background", (3,)),
         ):
-            found = tuple(getattr(self, name).shape)
+            value = getattr(self, name)
+            if not isinstance(value, Tensor):
+                raise DataError(
+                    f"{name} of the views is a {type(value).__name__}; expected a torch.Tensor"
+                )
+            found = tuple(value.shape)
             if found != shape:
                 raise DataError(f"{name} of the views has shape {found}; expected {shape}")
         if self.width < 1 or self.height < 1:

@@ -26,6 +26,23 @@ def test_a_wrong_shape_is_named(name, shape, message):
         normal_scene().replace(**{name: torch.zeros(shape)})
 
 
+@pytest.mark.parametrize("name", [name for name, _ in normal_scene().items()])
+def test_what_is_no_tensor_is_named(name):
+    value = getattr(normal_scene(), name).numpy()
+    with pytest.raises(SceneError, match=rf"{name} is a numpy.ndarray; expected a torch.Tensor"):
+        normal_scene().replace(**{name: value})
+    with pytest.raises(SceneError, match="means is a builtins.list"):
+        Gaussians(*([[0.0]] for _ in range(6)))
+
+
+@pytest.mark.parametrize("name", ["viewmats", "Ks", "background"])
+def test_views_of_what_is_no_tensor_are_refused(name):
+    parts = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "background": torch.ones(3)}
+    views = Views(**parts, width=8, height=6)
+    with pytest.raises(DataError, match=f"{name} of the views is a ndarray; expected a torch"):
+        dataclasses.replace(views, **{name: parts[name].numpy()})
+
+
 def test_mixed_or_integer_types_are_named():
     with pytest.raises(SceneError, match="scales is torch.float64 .* means are torch.float32"):
         normal_scene().replace(scales=torch.zeros(5, 3, dtype=torch.float64))

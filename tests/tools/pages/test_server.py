@@ -7,7 +7,8 @@ import math
 import socket
 import struct
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -17,7 +18,7 @@ import pytest
 import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.tools.pages import viewer as viewing
-from pointsplat_ns.tools.pages.server import LOCAL, refusal
+from pointsplat_ns.tools.pages.server import LIMITS, LOCAL, Answer, Limits, Route, Server, refusal
 from pointsplat_ns.tools.pages.viewer import Viewer
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -225,6 +226,7 @@ def test_bodies_have_a_size_that_is_said_and_not_too_large(viewer):
     assert post(viewer, "/scene", b"x" * 70_000)[0] == 413
     assert answer(viewer, "POST", "/scene", None, Origin=viewer.url)[0] == 411
     assert post(viewer, "/scene", b"x", Content_Length="-1")[0] == 411
+    assert post(viewer, "/scene", b"x", Content_Length="9" * 5_000)[0] == 413
     assert post(viewer, "/scene", b"x", Transfer_Encoding="chunked")[0] == 411
 
 
@@ -234,3 +236,128 @@ def test_bodies_have_a_size_that_is_said_and_not_too_large(viewer):
 def test_only_the_routes_are_served(path, viewer):
     status, body, _ = answer(viewer, "GET", path)
     assert status == (200 if path.startswith("/?") else 404) and b"root:" not in body
+
+
+QUICK = Limits(head_seconds=1.0, idle_seconds=1.0, bytes_a_second=1e9)
+"""Limits that end a test soon."""
+
+
+@pytest.fixture()
+def served(time_limit) -> Iterator[Callable[..., Server]]:
+    """Makes servers of a page of 64 MB, which no socket takes at once, and of a route that reads a
+    body."""
+    servers: list[Server] = []
+    large = bytes(1 << 26)
+
+    def make(limits: Limits | None = None) -> Server:
+        routes = {
+            "/": Route(lambda request: Answer(b"page")),
+            "/large": Route(lambda request: Answer(large)),
+            "/body": Route(lambda request: Answer(request.body.read(request.length)), 1 << 20),
+        }
+        servers.append(Server("127.0.0.1", 0, routes, limits))
+        return servers[-1]
+
+    yield make
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+def connected(server: Server, sent: bytes, address: str = "127.0.0.1") -> socket.socket:
+    client = socket.create_connection(
+        ("127.0.0.1", server.server_port), timeout=60, source_address=(address, 0)
+    )
+    client.sendall(sent)
+    return client
+
+
+def page_of(server: Server, address: str = "127.0.0.1") -> bytes:
+    """What a client of an address gets who asks for the page; nothing if it is refused."""
+    with connected(server, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", address) as client:
+        try:
+            return b"".join(iter(lambda: client.recv(1 << 16), b""))
+        except ConnectionError:
+            return b""
+
+
+def is_closed(client: socket.socket) -> bool:
+    """Whether the server has closed a connection on which it sends nothing."""
+    client.setblocking(False)
+    try:
+        return client.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def test_at_most_64_connections_are_open_and_who_comes_later_is_served(served):
+    server = served()
+    slow = [connected(server, b"GET / HT", f"127.0.0.{2 + index % 5}") for index in range(300)]
+    assert page_of(server).endswith(b"page") and page_of(server, "127.0.0.2").endswith(b"page")
+    assert sum(not is_closed(client) for client in slow) <= LIMITS.connections == 64
+    assert threading.active_count() < 200
+    for client in slow:
+        client.close()
+
+
+def test_heads_that_come_byte_by_byte_end(served):
+    server = served(QUICK)
+    with connected(server, b"GET / HTTP/1.1\r\n") as client:
+        client.settimeout(0.1)
+        while True:  # the fixture ends a test that does not
+            try:
+                client.sendall(b"x")
+                if client.recv(1) == b"":
+                    break
+            except TimeoutError:
+                continue
+            except ConnectionError:
+                break
+
+
+def test_one_address_that_reads_nothing_leaves_connections_to_others(served):
+    server = served()
+    ask = b"GET /large HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    greedy = []
+    for _ in range(LIMITS.of_one_address):
+        greedy.append(connected(server, ask, "127.0.0.2"))
+        assert greedy[-1].recv(12) == b"HTTP/1.0 200"
+    assert page_of(server, "127.0.0.2") == b""
+    assert page_of(server).endswith(b"page")
+    for client in greedy:
+        client.close()
+
+
+def test_answers_that_nobody_reads_and_bodies_that_nobody_sends_end(served):
+    server = served(QUICK)
+    with connected(server, b"GET /large HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") as client:
+        assert client.recv(12) == b"HTTP/1.0 200"
+        while server._open:
+            time.sleep(0.05)
+        got = b"".join(iter(lambda: _received(client), b""))
+    assert len(got) < 1 << 26
+    head = f"POST /body HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: {'http://127.0.0.1'}\r\n"
+    with connected(server, head.encode() + b"Content-Length: 100000\r\n\r\n") as client:
+        sender = threading.Thread(target=_trickled, args=(client,))
+        sender.start()
+        sender.join(30)
+        assert not sender.is_alive()
+
+
+def _received(client: socket.socket) -> bytes:
+    try:
+        return client.recv(1 << 20)
+    except ConnectionError:
+        return b""
+
+
+def _trickled(client: socket.socket) -> None:
+    """Send a byte ten times a second until the connection is cut."""
+    try:
+        while True:
+            client.sendall(b"x")
+            time.sleep(0.1)
+    except OSError:
+        pass
