@@ -17,7 +17,7 @@ from lab.common.printing import start
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.pipeline.options import PruneOptions, ViewOptions
 from pointsplat_ns.pipeline.photo_repair import photo_repair
-from pointsplat_ns.pipeline.prune import prune_scene
+from pointsplat_ns.pipeline.prune_scene import prune_scene
 from pointsplat_ns.pipeline.repair_budget import PhotoBudget
 from pointsplat_ns.pipeline.subject import read_subject
 

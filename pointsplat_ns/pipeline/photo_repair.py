@@ -39,10 +39,11 @@ from pointsplat_ns.pipeline.photos.examples import (
     render_of,
 )
 from pointsplat_ns.pipeline.reasons import Cause, Reason
-from pointsplat_ns.pipeline.repair import OptimisationRun, rate_factor
+from pointsplat_ns.pipeline.repair import OptimisationRun
 from pointsplat_ns.pipeline.repair_budget import PhotoBudget
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import prune
+from pointsplat_ns.refinement.schedules import cosine_factor
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views, spread_indices
 from pointsplat_ns.view_sampling.sampler import Sampler
@@ -208,7 +209,9 @@ def _scenes(
         adam = Adam(scene, PHOTO_REPAIR.adam, rates)
 
         def choose(scene: Gaussians, adam: Adam = adam) -> tuple[float, Tensor]:
-            return rate_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(scene, adam.reach)
+            return cosine_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(
+                scene, adam.reach
+            )
 
         # the last time when half of the steps are done
         until = 0.5 * turn / PHOTO_REPAIR.moves if turn <= PHOTO_REPAIR.moves else math.inf

@@ -21,6 +21,7 @@ from pointsplat_ns.pipeline.repair_budget import RepairBudget
 from pointsplat_ns.pipeline.repair_state import Unfinished
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.refinement.feedback import FeedbackRefiner, shipped_feedback_refiner
+from pointsplat_ns.refinement.schedules import cosine_factor
 from pointsplat_ns.rendering.comparison.sizes import SMALLEST_SIDE
 from pointsplat_ns.scene.gaussians import Gaussians
 
@@ -98,7 +99,7 @@ def repair(
             else:
                 expected = round(run.count / run.done) if run.done else REPAIR.most_steps
             factors = feedback.factors(network, scene, run.done, expected)
-        return first_factor * rate_factor(run.done), factors
+        return first_factor * cosine_factor(run.done, REPAIR.last_factor), factors
 
     def kept(scenes: Iterator[Gaussians], first: int) -> Iterator[Gaussians]:
         for count, scene in enumerate(scenes, first + 1):
@@ -173,12 +174,6 @@ def _examples(
     )  # 0.2 GB where pictures are 16 to 9
     others = itertools.islice(views.others(count=count, drawn_side=side), taken, None)
     return (functools.partial(drawn, dense, view) for view in others)
-
-
-def rate_factor(done: float, last: float = REPAIR.last_factor) -> float:
-    """Factor on the learning rates when a share of the steps, in [0, 1], is done: a half cosine
-    that falls from 1 to ``last``."""
-    return last + (1 - last) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 def initial_rate_factor(psnr: float) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.pipeline.cleaning import Cleaning, clean_scene
-from pointsplat_ns.pipeline.compact import compact_scene, compact_to_quality
+from pointsplat_ns.pipeline.compact_scene import compact_scene, compact_to_quality
 from pointsplat_ns.pipeline.options import (
     CompactOptions,
     PruneOptions,
@@ -18,8 +18,8 @@ from pointsplat_ns.pipeline.options import (
     default_device,
 )
 from pointsplat_ns.pipeline.photos.posed_photos import held_out_psnrs
-from pointsplat_ns.pipeline.prune import prune_scene
 from pointsplat_ns.pipeline.prune_file import prune_file, rows_to_prune
+from pointsplat_ns.pipeline.prune_scene import prune_scene
 from pointsplat_ns.pipeline.quality import Judge, judge_of
 from pointsplat_ns.pipeline.report import Report, StageResult, last_accepted
 from pointsplat_ns.pipeline.subject import Source, Subject, read_subject

@@ -1,7 +1,7 @@
 """A differentiable rasterizer of 3D Gaussians in pure torch, shaped like gsplat's."""
 
 from pointsplat_ns.rendering.rasterization import rasterization
-from pointsplat_ns.rendering.scenes import (
+from pointsplat_ns.rendering.render_scene import (
     pixel_sums,
     pixels_of,
     render,

@@ -1,7 +1,7 @@
 """Front-to-back alpha blending over tiles, with its own backward pass.
 
 Done in torch (:mod:`~pointsplat_ns.rendering.blocks`), or by compiled kernels where they were
-built (:mod:`~pointsplat_ns.rendering.compiled.blending`), by the algebra of
+built (:mod:`~pointsplat_ns.rendering.compiled.blending_kernels`), by the algebra of
 :mod:`~pointsplat_ns.rendering.quadratics` and the rule of :mod:`~pointsplat_ns.rendering.alpha`.
 
 Shapes: M Gaussians, 64 = TILE * TILE pixels, D channels.
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.rendering import blocks
-from pointsplat_ns.rendering.compiled import blending as compiled_blending
+from pointsplat_ns.rendering.compiled import blending_kernels as compiled_blending
 from pointsplat_ns.rendering.constants import MEMORY_BUDGET, TILE
 from pointsplat_ns.rendering.projection import Projected
 from pointsplat_ns.rendering.quadratics import MOMENTS, PIXELS

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 
 from pointsplat_ns.rendering import ellipses as in_torch
-from pointsplat_ns.rendering.compiled import tiles as by_kernels
+from pointsplat_ns.rendering.compiled import tile_kernels as by_kernels
 from pointsplat_ns.rendering.constants import ALPHA_MIN
 from pointsplat_ns.rendering.ellipses import Grid, TileList
 from pointsplat_ns.rendering.projection import Projected

@@ -1,6 +1,6 @@
 """Pictures by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one
 pass over the Gaussians, then blending as for any picture
-(:mod:`~pointsplat_ns.rendering.compiled.blending`). Gradients by the parameters of a scene take
+(:mod:`~pointsplat_ns.rendering.compiled.blending_kernels`). Gradients by the parameters of a scene take
 another pass.
 
 :func:`~pointsplat_ns.rasterization` gives the same pictures and gradients to rounding.
@@ -16,7 +16,8 @@ from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.rendering import projection
 from pointsplat_ns.rendering.blending import tiled, untiled
-from pointsplat_ns.rendering.compiled import blending, tiles
+from pointsplat_ns.rendering.compiled import blending_kernels as blending
+from pointsplat_ns.rendering.compiled import tile_kernels as tiles
 from pointsplat_ns.rendering.constants import MEMORY_BUDGET
 from pointsplat_ns.rendering.ellipses import Grid, TileList
 from pointsplat_ns.rendering.projection import Camera, count_meaningless

@@ -17,7 +17,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.lenses import Lens, lens_of, pixel_map
 from pointsplat_ns.scene.camera_files import NamedViews
-from pointsplat_ns.scene.camera_files.cameras import Camera
+from pointsplat_ns.scene.camera_files.camera_views import Camera
 from pointsplat_ns.scene.image_files import IMAGE_ERRORS, exif_hint, open_image
 from pointsplat_ns.system.files import one_line
 from pointsplat_ns.system.tensors import DOUBLES

@@ -23,7 +23,7 @@ from typing import Any, Literal
 import torch
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.pipeline.compact import compact_scene, compact_to_quality
+from pointsplat_ns.pipeline.compact_scene import compact_scene, compact_to_quality
 from pointsplat_ns.pipeline.options import CompactOptions
 from pointsplat_ns.pipeline.quality import judge_of, read_back
 from pointsplat_ns.pipeline.repair_budget import Effort

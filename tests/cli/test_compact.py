@@ -185,7 +185,7 @@ def test_what_cannot_be_used_is_refused_in_one_line_and_early(
     ply, helps, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(
-        "pointsplat_ns.pipeline.compact.prune_scene", None
+        "pointsplat_ns.pipeline.compact_scene.prune_scene", None
     )  # a call of it would be no error of ours
     save_refiner(Refiner(preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
     shown = tmp_path / "shown"

@@ -21,7 +21,7 @@ from pointsplat_ns.pipeline.cleaning import (
     floating_scores,
 )
 from pointsplat_ns.pipeline.options import PruneOptions
-from pointsplat_ns.pipeline.prune import prune_scene
+from pointsplat_ns.pipeline.prune_scene import prune_scene
 from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep
 from pointsplat_ns.rendering.comparison.closeness import DenseReference

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-import pointsplat_ns.pipeline.compact as compact_module
+import pointsplat_ns.pipeline.compact_scene as compact_module
 import pointsplat_ns.pipeline.stages as stages_module
 from making import ball, same
 from pointsplat_ns.api import Compacted
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.pipeline.acceptance import closer_in
-from pointsplat_ns.pipeline.compact import compact_scene
+from pointsplat_ns.pipeline.compact_scene import compact_scene
 from pointsplat_ns.pipeline.options import CompactOptions
 from pointsplat_ns.pipeline.repair import Repaired
 from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner

@@ -16,7 +16,7 @@ from pointsplat_ns.pipeline.budget_search import (
     smallest_within,
 )
 from pointsplat_ns.pipeline.options import PruneOptions
-from pointsplat_ns.pipeline.prune import prune_scene
+from pointsplat_ns.pipeline.prune_scene import prune_scene
 from pointsplat_ns.pipeline.report import PsnrSearch
 from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import METHODS, WithinPsnr, score_of, select

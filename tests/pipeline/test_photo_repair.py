@@ -15,7 +15,7 @@ from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.pipeline import photo_repair as module
 from pointsplat_ns.pipeline import repair_budget
 from pointsplat_ns.pipeline import stages as stages_module
-from pointsplat_ns.pipeline.compact import compact_scene, compact_to_quality
+from pointsplat_ns.pipeline.compact_scene import compact_scene, compact_to_quality
 from pointsplat_ns.pipeline.optimiser import (
     RATES,
     Adam,

@@ -6,7 +6,7 @@ import pytest
 
 from making import ball, same
 from pointsplat_ns.pipeline.options import PruneOptions
-from pointsplat_ns.pipeline.prune import Pruned, prune_scene
+from pointsplat_ns.pipeline.prune_scene import Pruned, prune_scene
 from pointsplat_ns.pipeline.report import ShCut
 from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import METHODS, Keep, WithinPsnr, select

@@ -9,7 +9,8 @@ import pytest
 import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.pipeline import compact, stages, view_provider
+from pointsplat_ns.pipeline import compact_scene as compact
+from pointsplat_ns.pipeline import stages, view_provider
 from pointsplat_ns.pipeline.quality import Judge, quality_of_file, through_file
 from pointsplat_ns.pipeline.repair import Repaired
 from pointsplat_ns.pipeline.view_provider import ViewProvider

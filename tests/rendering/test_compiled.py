@@ -7,7 +7,7 @@ import torch
 
 from making import assert_same_on_any_threads, splats_in_view
 from pointsplat_ns.rendering import rasterization
-from pointsplat_ns.rendering.compiled import blending
+from pointsplat_ns.rendering.compiled import blending_kernels as blending
 from pointsplat_ns.rendering.spherical_harmonics import sh_to_color
 from pointsplat_ns.system.kernels import KERNELS
 

@@ -8,7 +8,7 @@ import torch
 
 from making import assert_same_on_any_threads, normal_scene
 from pointsplat_ns.rendering import pixels_of, render
-from pointsplat_ns.rendering import scenes as drawing
+from pointsplat_ns.rendering import render_scene as drawing
 from pointsplat_ns.rendering import whole_pictures as pictures
 from pointsplat_ns.scene.views import View
 from pointsplat_ns.system.kernels import KERNELS

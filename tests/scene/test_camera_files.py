@@ -19,7 +19,8 @@ from refusing import fails
 
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices, viewmats_to_opengl
-from pointsplat_ns.scene.camera_files import cameras, is_camera_file, read_named_views
+from pointsplat_ns.scene.camera_files import camera_views as cameras
+from pointsplat_ns.scene.camera_files import is_camera_file, read_named_views
 from posing import inria, name_of, nerfstudio, write_colmap, write_sparse, written
 
 

@@ -21,7 +21,7 @@ from pointsplat_ns.nerfstudio_plugin.datamanager import (
 from pointsplat_ns.nerfstudio_plugin.frames import UndistortedDataset
 from pointsplat_ns.nerfstudio_plugin.image_guard import photos_alone
 from pointsplat_ns.nerfstudio_plugin.replica.layout import PinholeParams, read_depth, read_photo
-from pointsplat_ns.scene.camera_files.cameras import Camera
+from pointsplat_ns.scene.camera_files.camera_views import Camera
 from pointsplat_ns.scene.image_files import IMAGE_FORMATS, exif_hint, open_image, read_reduced
 from pointsplat_ns.scene.photo_files import PHOTO_SUFFIXES, PhotoReader
 

@@ -13,7 +13,7 @@ from hostile import POSTSCRIPT, png_of, webp_of
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.lenses import lens_of, pixel_map
 from pointsplat_ns.scene.camera_files import read_named_views
-from pointsplat_ns.scene.camera_files.cameras import Camera
+from pointsplat_ns.scene.camera_files.camera_views import Camera
 from pointsplat_ns.scene.photo_files import PhotoReader, photo_files, photos_of_cameras
 
 BENT = Lens(distortion=(-0.2, 0.05, 0.004, -0.003))

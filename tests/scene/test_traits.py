@@ -13,7 +13,7 @@ from foreign import encode_spz4
 import pointsplat_ns as ps
 from making import ball, cloud, run_of, same_bits, small_refiner
 from pointsplat_ns.geometry.transforms import direction_of
-from pointsplat_ns.rendering.scenes import pixels_of
+from pointsplat_ns.rendering.render_scene import pixels_of
 from pointsplat_ns.scene.gaussians import Traits
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -15,7 +15,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainer
-from pointsplat_ns.pipeline.repair import rate_factor
+from pointsplat_ns.refinement.schedules import cosine_factor
 from pointsplat_ns.system import processes
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def rate_factor_at(
     last = 0.02
     if share < warm_up:
         return share / warm_up
-    return rate_factor(min(1.0, (share - warm_up) / (1 - warm_up)), last)
+    return cosine_factor(min(1.0, (share - warm_up) / (1 - warm_up)), last)
 
 
 class PointSplatTrainer(StoppableTrainer):

@@ -30,7 +30,7 @@ from pointsplat_ns.pipeline.photos.pose_check import (
     likeness,
 )
 from pointsplat_ns.scene.camera_files import NamedViews
-from pointsplat_ns.scene.camera_files.cameras import Motion
+from pointsplat_ns.scene.camera_files.camera_views import Motion
 from pointsplat_ns.scene.camera_files.colmap import colmap_points
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views, spread_indices

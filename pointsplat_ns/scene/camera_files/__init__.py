@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.scene.camera_files.cameras import (
+from pointsplat_ns.scene.camera_files.camera_views import (
     Camera,
     CameraFile,
     Motion,

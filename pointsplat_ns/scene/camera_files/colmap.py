@@ -23,7 +23,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices
-from pointsplat_ns.scene.camera_files.cameras import (
+from pointsplat_ns.scene.camera_files.camera_views import (
     MOST_CAMERAS,
     Camera,
     CameraFile,

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.scene.camera_files.cameras import (
+from pointsplat_ns.scene.camera_files.camera_views import (
     Camera,
     CameraFile,
     Motion,

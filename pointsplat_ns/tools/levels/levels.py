@@ -21,7 +21,7 @@ from pointsplat_ns.errors import BudgetError, DataError, PointSplatError
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.pipeline.acceptance import Comparison
 from pointsplat_ns.pipeline.options import ReductionOptions, default_device
-from pointsplat_ns.pipeline.prune import prune_scene
+from pointsplat_ns.pipeline.prune_scene import prune_scene
 from pointsplat_ns.pipeline.quality import Judge, Quality
 from pointsplat_ns.pipeline.repair_budget import RepairBudget
 from pointsplat_ns.pipeline.report import StageResult
@@ -39,11 +39,11 @@ from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.files import need_folder, need_writable
 from pointsplat_ns.system.outputs import claim
 from pointsplat_ns.system.progress import Progress, within
-from pointsplat_ns.tools.levels.errors import pixel_sizes
 from pointsplat_ns.tools.levels.folder import check_folder, level_names, write_levels
+from pointsplat_ns.tools.levels.level_errors import pixel_sizes
 from pointsplat_ns.tools.levels.paged import write_paged
 from pointsplat_ns.tools.levels.stream import write_stream
-from pointsplat_ns.tools.levels.tiles import TILESET, placed, write_tiles
+from pointsplat_ns.tools.levels.tiles_3d import TILESET, placed, write_tiles
 from pointsplat_ns.tools.wording import origin_text, quality_text, sh_text, stage_text
 from pointsplat_ns.view_sampling.content import content_box
 

@@ -30,7 +30,7 @@ def write_paged(
 
     Args:
         path: the file.
-        levels, parents, progress: as of :func:`~pointsplat_ns.tools.levels.tiles.write_tiles`.
+        levels, parents, progress: as of :func:`~pointsplat_ns.tools.levels.tiles_3d.write_tiles`.
 
     Returns:
         The number of Gaussians written.

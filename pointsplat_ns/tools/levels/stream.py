@@ -35,7 +35,7 @@ def write_stream(
     Args:
         folder: created if it is missing.
         levels, parents, progress, force: as of
-            :func:`~pointsplat_ns.tools.levels.tiles.write_tiles`.
+            :func:`~pointsplat_ns.tools.levels.tiles_3d.write_tiles`.
 
     Returns:
         The number of Gaussians written of each level.

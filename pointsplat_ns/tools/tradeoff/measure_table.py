@@ -24,6 +24,7 @@ from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tools.pages.html import page
 from pointsplat_ns.tools.pages.image_encoding import picture_uri, to_uint8
+from pointsplat_ns.tools.tradeoff.measured_scene import make, subject_at
 from pointsplat_ns.tools.tradeoff.measuring import Measurer, busy_note, machine_text
 from pointsplat_ns.tools.tradeoff.points import (
     DENSE,
@@ -36,7 +37,6 @@ from pointsplat_ns.tools.tradeoff.points import (
     write_points,
 )
 from pointsplat_ns.tools.tradeoff.recommend import next_best, recommend
-from pointsplat_ns.tools.tradeoff.subject import make, subject_at
 from pointsplat_ns.tools.wording import decibels, impression, views_of_size
 
 

@@ -32,8 +32,8 @@ from pointsplat_ns.scene.views import View, Views, spread_indices
 from pointsplat_ns.system.cores import OtherPrograms, cores
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.threads import most_threads, now
+from pointsplat_ns.tools.tradeoff.measured_scene import Subject
 from pointsplat_ns.tools.tradeoff.points import DENSE, ImageMetrics, Point, Setting, Speed
-from pointsplat_ns.tools.tradeoff.subject import Subject
 from pointsplat_ns.tools.wording import origin_text
 
 ROUNDS = 3

@@ -18,9 +18,9 @@ import pointsplat_ns as ps
 from making import ball, normal_scene
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.system.progress import silent
-from pointsplat_ns.tools.levels.errors import pixel_size_for
+from pointsplat_ns.tools.levels.level_errors import pixel_size_for
 from pointsplat_ns.tools.levels.levels import LevelOutput
-from pointsplat_ns.tools.levels.tiles import write_tiles
+from pointsplat_ns.tools.levels.tiles_3d import write_tiles
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -216,7 +216,7 @@ def test_older_tiles_need_force_and_stay_when_writing_fails(tmp_path, monkeypatc
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(ps.SceneError, match=r"tileset\.json: exists already"):
         LevelOutput(tmp_path / "a", "tiles", None, None, force=False).check(2)
-    monkeypatch.setattr("pointsplat_ns.tools.levels.tiles.encode_tile", lambda *_: 1 / 0)
+    monkeypatch.setattr("pointsplat_ns.tools.levels.tiles_3d.encode_tile", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double())
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

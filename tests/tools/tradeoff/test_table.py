@@ -16,7 +16,8 @@ import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.pipeline import compact, repair, view_provider
+from pointsplat_ns.pipeline import compact_scene as compact
+from pointsplat_ns.pipeline import repair, view_provider
 from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.pipeline.repair import Repaired
 from pointsplat_ns.pipeline.view_provider import ViewProvider
@@ -24,6 +25,7 @@ from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tools.tradeoff import measure_table as table
 from pointsplat_ns.tools.tradeoff import measuring
 from pointsplat_ns.tools.tradeoff.measure_table import settings_of
+from pointsplat_ns.tools.tradeoff.measured_scene import Subject, make
 from pointsplat_ns.tools.tradeoff.measuring import views_to_judge
 from pointsplat_ns.tools.tradeoff.points import DENSE, Setting
 from pointsplat_ns.tools.tradeoff.recommend import (
@@ -32,7 +34,6 @@ from pointsplat_ns.tools.tradeoff.recommend import (
     fastest_within,
     recommend,
 )
-from pointsplat_ns.tools.tradeoff.subject import Subject, make
 from trades import POINTS, point
 
 pytestmark = pytest.mark.usefixtures("quick")

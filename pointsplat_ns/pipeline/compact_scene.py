@@ -17,7 +17,7 @@ from pointsplat_ns.pipeline.acceptance import Comparison
 from pointsplat_ns.pipeline.budget_search import FileLimit, smallest_within
 from pointsplat_ns.pipeline.options import CompactOptions, default_device
 from pointsplat_ns.pipeline.photos.examples import Photos, mean_psnr
-from pointsplat_ns.pipeline.prune import prune_scene
+from pointsplat_ns.pipeline.prune_scene import prune_scene
 from pointsplat_ns.pipeline.quality import Judge, through_file
 from pointsplat_ns.pipeline.report import Report, StageResult, TargetSearch, last_accepted
 from pointsplat_ns.pipeline.stages import Context, Refine, Repair, TrainOnPhotos, rounded
@@ -61,7 +61,7 @@ def compact_scene(
         The result. Its scenes are on the device of ``dense``.
 
     Raises:
-        BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.pipeline.prune.prune_scene`.
+        BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.pipeline.prune_scene.prune_scene`.
         SceneError: if the SH degree exceeds the refiner's.
         DataError: if the budget or ``sh`` needs views and there are none.
     """

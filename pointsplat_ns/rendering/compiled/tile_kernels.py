@@ -9,7 +9,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rendering.compiled.blending import inputs_of
+from pointsplat_ns.rendering.compiled.blending_kernels import inputs_of
 from pointsplat_ns.rendering.constants import SLACK
 from pointsplat_ns.rendering.ellipses import Ellipses, Grid, TileList
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads

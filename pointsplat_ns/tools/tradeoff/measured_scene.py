@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pointsplat_ns.pipeline.compact import compact_scene
+from pointsplat_ns.pipeline.compact_scene import compact_scene
 from pointsplat_ns.pipeline.options import NO_POSES, CompactOptions, PruneOptions, ViewOptions
 from pointsplat_ns.pipeline.photos.examples import Photos
-from pointsplat_ns.pipeline.prune import prune_scene
+from pointsplat_ns.pipeline.prune_scene import prune_scene
 from pointsplat_ns.pipeline.run_data import run_data
 from pointsplat_ns.pipeline.subject import read_subject
 from pointsplat_ns.pipeline.view_provider import ViewProvider
