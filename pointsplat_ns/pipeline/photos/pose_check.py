@@ -60,11 +60,12 @@ class PoseFaults:
     """Number of views that show nothing sharp."""
 
     @property
-    def text(self) -> str:
-        """What is wrong, for an error; empty if at least half of the views are right, or none was
-        drawn."""
-        if self.checked == 0 or 2 * (self.empty + self.smeared) <= self.checked:
-            return ""
+    def serious(self) -> bool:
+        """Whether more than half of the views are wrong."""
+        return 2 * (self.empty + self.smeared) > self.checked
+
+    def __str__(self) -> str:
+        """The faults, for an error."""
         seen = f"{self.checked - self.empty} of {self.checked} cameras see anything of the scene"
         return seen + (f", {self.smeared} of them nothing but a blur" if self.smeared else "")
 
@@ -124,16 +125,18 @@ class Likeness:
     """Number of photos."""
 
     @property
-    def text(self) -> str:
-        """What is wrong, for an error; empty if renders are like their own photos, or there is
-        none. Right poses have an advantage of 0.43 and more over the photos of other views, wrong
-        frames up to 0.3: a kitchen at half the scale."""
-        if self.count == 0 or self.own >= MIN_LIKENESS or self.own - self.others >= 0.2:
-            return ""
+    def enough(self) -> bool:
+        """Whether renders are like their own photos, or there is none. Right poses have an
+        advantage of 0.43 and more over the photos of other views, wrong frames up to 0.3: a kitchen
+        at half the scale."""
+        return self.count == 0 or self.own >= MIN_LIKENESS or self.own - self.others >= 0.2
+
+    def __str__(self) -> str:
+        """The figures, for an error where they are not :attr:`enough`."""
         return (
             "renders of the scene are no more like the photos of their views than like others "
-            f"({self.psnr:.1f} dB "
-            f"PSNR in {self.count} photos, correlation {self.own:.2f} and {self.others:.2f})"
+            f"({self.psnr:.1f} dB PSNR in {self.count} photos, correlation {self.own:.2f} and "
+            f"{self.others:.2f})"
         )
 
 

@@ -111,10 +111,9 @@ class PosesFile:
             DataError: if most views show nothing of the scene, or nothing sharp, or renders are not
                 like the photos. A scene without a visible Gaussian is not refused here.
         """
-        wrong = pose_faults(scene, self.views).text
-        if not wrong and photos:
-            wrong = likeness(scene, self._photos()).text
-        if not wrong:
+        faults = pose_faults(scene, self.views)
+        like = None if faults.serious or not photos else likeness(scene, self._photos())
+        if not faults.serious and (like is None or like.enough):
             return
         mend = (
             "nerfstudio moves and scales scenes, and its run says how in "
@@ -127,7 +126,7 @@ class PosesFile:
                 "write the scene again from its run"
             )
         raise DataError(
-            f"{self.path}: {wrong}; poses and scene are probably in different frames: {mend}"
+            f"{self.path}: {faults if like is None else like}; poses and scene are probably in different frames: {mend}"
         )
 
     def _photos(self) -> list[Photo]:
@@ -151,9 +150,10 @@ def check_photos(scene: Gaussians, photos: Sequence[Photo], data: Path | str) ->
     """Raise a DataError if renders of a scene are not like the photos of its training, a few of
     which are read; ``data`` is the path of these."""
     some = [photos[index] for index in spread_indices(len(photos), POSE_CHECK.views)]
-    if wrong := likeness(scene, some).text:
+    like = likeness(scene, some)
+    if not like.enough:
         raise DataError(
-            f"{data}: {wrong}; the photos or their poses are probably not those of the training: "
+            f"{data}: {like}; the photos or their poses are probably not those of the training: "
             "put back the data as it was, or name the folder where it is now (--data DIR)"
         )
 
