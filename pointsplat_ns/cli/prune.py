@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_if_larger, print_json, print_result, scene_result
+from pointsplat_ns.system.terminal import say
 
 
 def prune(
@@ -107,4 +108,4 @@ def prune(
     print_result(by, [], before, small, seconds, output, quality if rows is None else unknown)
     print_if_larger(scene, output)
     if verbose and quality is not None:
-        print(quality.details)
+        say(quality.details)
