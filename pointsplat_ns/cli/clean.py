@@ -7,6 +7,7 @@ from pathlib import Path
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, print_result, scene_result
 from pointsplat_ns.pipeline.options import ViewOptions
+from pointsplat_ns.system.terminal import say
 
 
 def clean(
@@ -52,4 +53,4 @@ def clean(
         return
     print_result("clean", [], before, done.scene, done.seconds, output, quality)
     if picture is not None:
-        print(f"{picture}: the scene, what goes, and the result, side by side")
+        say(f"{picture}: the scene, what goes, and the result, side by side")

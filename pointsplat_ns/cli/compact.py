@@ -20,6 +20,7 @@ from pointsplat_ns.cli.printing import (
     written_size,
 )
 from pointsplat_ns.pipeline.options import CompactOptions
+from pointsplat_ns.system.terminal import say
 
 if TYPE_CHECKING:
     from pointsplat_ns.pipeline.quality import Quality
@@ -155,9 +156,9 @@ def compact(
         _print_result(report, output, quality)
         print_if_larger(scene, output)
         if verbose and quality is not None:
-            print(quality_details(quality))
+            say(quality_details(quality))
         if shown is not None:
-            print(shown)
+            say(shown)
         _print_use(goal, html, scene, quality)
     if report.interrupted:
         raise KeyboardInterrupt  # once the best result so far is written and printed
@@ -296,12 +297,12 @@ def _print_folder(
             )
         header = ("scene", "before", "after", "MB", "dB", "seconds", "status")
         print_table(header, rows, "dB: PSNR against the scene's own renders", left=(0, 6))
-        print(
+        say(
             f"{folder}: {len(results) - failed} of {len(results)} scenes, and the table "
             f"{FOLDER_FILES.scenes_table}"
         )
         for path in shown:
-            print(f"{path}: all scenes before and after")
+            say(f"{path}: all scenes before and after")
     if failed:
         raise PointSplatError(
             f"{failed} of {len(results)} scenes failed; the same command tries them again"
@@ -329,10 +330,10 @@ def _print_use(
 
     if page is not None:
         use = GOALS[goal].use.format(url=quote(page.name), name=escape(name_of(scene)))
-        print(f"{page}: {written_size(page)}, {use}")
+        say(f"{page}: {written_size(page)}, {use}")
     if goal == "headset" and quality is not None:
         fill = f"{quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
-        print(f"fill: {fill}; where it is too slow near things, a smaller --keep lowers it")
+        say(f"fill: {fill}; where it is too slow near things, a smaller --keep lowers it")
 
 
 def _print_next(scene: Path, output: Path, quality: Quality | None) -> None:
@@ -354,4 +355,5 @@ def _print_next(scene: Path, output: Path, quality: Quality | None) -> None:
         ["pointsplat", "view", str(scene), str(output)],
         ["pointsplat", "compact", str(scene), *other],
     )
-    print("next: " + "\n      ".join(map(shlex.join, commands)))
+    first, *others = map(shlex.join, commands)
+    say(f"next: {first}", *(f"      {other}" for other in others))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import written_size
+from pointsplat_ns.system.terminal import say
 
 
 def demo(output: options.Output = None, force: options.Force = False) -> None:
@@ -21,4 +22,4 @@ def demo(output: options.Output = None, force: options.Force = False) -> None:
     scene = ps.example_room()
     options.check_outputs(path, force)
     ps.save(scene, path, overwrite=True)
-    print(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")
+    say(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")

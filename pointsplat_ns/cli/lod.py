@@ -10,7 +10,7 @@ from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
 from pointsplat_ns.pipeline.options import Bands, ViewOptions
 from pointsplat_ns.system.quantities import counted
-from pointsplat_ns.system.terminal import print_table
+from pointsplat_ns.system.terminal import print_table, say
 
 if TYPE_CHECKING:
     from pointsplat_ns.tools.levels.levels import Levels
@@ -124,8 +124,6 @@ def _print_table(made: Levels, folder: Path) -> None:
         )
     files = [path for path in (folder, *folder.rglob("*")) if path.is_file()]
     size = bytes_text(sum(path.stat().st_size for path in files))
-    print(
-        f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all"
-    )
+    say(f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all")
     header = ("", "Gaussians", "share", "MB", "seconds", "dB", "SSIM", "")
     print_table(header, rows, "dB: PSNR against the dense scene", left=(0, 7))

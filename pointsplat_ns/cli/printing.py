@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from pointsplat_ns.system.quantities import seconds_text
+from pointsplat_ns.system.terminal import say
 
 if TYPE_CHECKING:
     from pointsplat_ns.pipeline.quality import Quality
@@ -80,13 +81,13 @@ def print_result(
             by, "nothing is pruned"
         )
         what = f"{nothing}, all {before:,} Gaussians fit as they are"
-    print(f"{where}: {what}, {written_size(where)}, in {seconds_text(seconds)}")
+    say(f"{where}: {what}, {written_size(where)}, in {seconds_text(seconds)}")
     if quality is not None:
-        print(quality_text(quality))
+        say(quality_text(quality))
     elif in_parts:
-        print("not compared with the dense scene: it does not fit into memory")
+        say("not compared with the dense scene: it does not fit into memory")
     else:
-        print("not compared with the dense scene: nothing of it is visible")
+        say("not compared with the dense scene: nothing of it is visible")
 
 
 def print_if_larger(scene: Path, where: Path) -> None:
@@ -98,7 +99,7 @@ def print_if_larger(scene: Path, where: Path) -> None:
             if scene.suffix == where.suffix
             else f"; a name that ends in {scene.suffix} makes it smaller"
         )
-        print(
+        say(
             f"note: {where} is larger than {scene}: {written_size(where)}, not "
             f"{written_size(scene)}{remedy}"
         )

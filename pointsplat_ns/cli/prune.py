@@ -7,6 +7,7 @@ from dataclasses import replace
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_if_larger, print_json, print_result, scene_result
 from pointsplat_ns.pipeline.options import PruneOptions
+from pointsplat_ns.system.terminal import say
 
 
 def prune(
@@ -63,4 +64,4 @@ def prune(
     print_result(how.by, [], before, small, seconds, output, quality, in_parts)
     print_if_larger(scene, output)
     if verbose and quality is not None:
-        print(quality_details(quality))
+        say(quality_details(quality))

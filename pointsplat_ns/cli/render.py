@@ -11,6 +11,7 @@ import tyro
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json
 from pointsplat_ns.system.quantities import seconds_text
+from pointsplat_ns.system.terminal import say
 
 
 def render(
@@ -75,4 +76,4 @@ def render(
         print_json({"output": output, "frames": count, "bytes": size, "seconds": seconds_taken})
         return
     frames = "1 frame" if count == 1 else f"{count} frames"
-    print(f"{output}: {frames}, {bytes_text(size)}, in {seconds_text(seconds_taken)}")
+    say(f"{output}: {frames}, {bytes_text(size)}, in {seconds_text(seconds_taken)}")

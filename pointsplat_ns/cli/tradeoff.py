@@ -10,7 +10,7 @@ from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
 from pointsplat_ns.pipeline.options import ViewOptions
 from pointsplat_ns.system.quantities import counted
-from pointsplat_ns.system.terminal import print_table
+from pointsplat_ns.system.terminal import print_table, say
 
 if TYPE_CHECKING:
     from pointsplat_ns.tools.tradeoff.points import Tradeoff
@@ -73,17 +73,17 @@ def tradeoff(
         return
     _print_table(found)
     for note in found.notes:
-        print(f"note: {note}")
-    print(found.why)
+        say(f"note: {note}")
+    say(found.why)
     best = found.point(found.recommended)
     best = (
         next_best(found.points) or best if best is found.points[0] else best
     )  # the dense scene needs no command
     if best is not found.points[0]:
-        print(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
+        say(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
     if best.command:
-        print(f"$ {best.command}")
-    print(f"open {folder / RESULTS['page']}")
+        say(f"$ {best.command}")
+    say(f"open {folder / RESULTS['page']}")
 
 
 def _print_table(found: Tradeoff) -> None:
@@ -92,8 +92,8 @@ def _print_table(found: Tradeoff) -> None:
 
     photos = found.points[0].against_photos is not None
     count = counted(len(found.points), "point")
-    print(f"{found.scene}: {count}, judged in {found.judged_in}, {found.views_origin}")
-    print(found.machine)
+    say(f"{found.scene}: {count}, judged in {found.judged_in}, {found.views_origin}")
+    say(found.machine)
     rows = []
     for point in found.points:
         rows.append(

@@ -21,12 +21,12 @@ import yaml
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
 from pointsplat_ns.nerfstudio_plugin.option_checks import check_options
 from pointsplat_ns.scene.checkpoints import read_training_state
@@ -34,6 +34,7 @@ from pointsplat_ns.scene.runs import RUN_FILES, step_of
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.files import one_line, replacing
 from pointsplat_ns.system.memory import keep_freed_memory
+from pointsplat_ns.system.terminal import say
 from pointsplat_ns.system.threads import fixed_threads, one_thread_each
 
 STATE = "pointsplat"
@@ -85,7 +86,7 @@ class StoppableTrainerConfig(TrainerConfig):
         path = self.get_base_dir() / RUN_FILES.config
 
         def write() -> None:
-            CONSOLE.log(f"Saving config to: {path}")
+            log(f"Saving config to: {path}")
             with replacing(path, named=False) as part:
                 part.write_text(yaml.dump(self), "utf-8")
 
@@ -168,7 +169,7 @@ class StoppableTrainer(Trainer):
                     self.given_config.write_config()
             model = self.config.pipeline.model
             if self.local_rank == 0 and isinstance(model, RasterizerOptions):
-                CONSOLE.log(model.engine(torch.device(self.device)))
+                log(model.engine(torch.device(self.device)))
         except KeyboardInterrupt:
             _interrupted(signal.SIGINT)
         if self.local_rank == 0:
@@ -186,7 +187,7 @@ class StoppableTrainer(Trainer):
             except KeyboardInterrupt:
                 if self._between_steps and self.step > self._start_step:
                     self.save_checkpoint(self.step - 1)
-                    CONSOLE.log(
+                    log(
                         f"Saved after step {self.step - 1}. The run is usable as it is; to go on: "
                         f"--load-dir {self.checkpoint_dir}"
                     )
@@ -233,7 +234,7 @@ class StoppableTrainer(Trainer):
                 "same method and settings"
             ) from error
         self.step = self._start_step
-        CONSOLE.log(f"going on after step {content['step']} of {path}")
+        log(f"going on after step {content['step']} of {path}")
 
     def put_back(self, state: Any) -> None:
         """Put back :meth:`state_to_resume`; None if the checkpoint has none."""
@@ -322,7 +323,7 @@ class StoppableTrainer(Trainer):
         for name, text in processes.gathered([(source, "; ".join(faults))] if faults else []):
             self.skipped[name] += 1
             if self.skipped[name] == 1 and processes.rank() == 0:
-                CONSOLE.log(f"step {step} is skipped: {name}: {text} (said once for each)")
+                log(f"step {step} is skipped: {name}: {text} (said once for each)")
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -387,10 +388,7 @@ class StoppableTrainer(Trainer):
         self._between_steps = self.training_state == "paused"
         if not first or self.training_state != "training":
             raise KeyboardInterrupt
-        print(
-            "stopping after this step; once more to stop at once, without saving it",
-            file=sys.stderr,
-        )
+        say("stopping after this step; once more to stop at once, without saving it", error=True)
 
 
 def all_finite(parameters: list[nn.Parameter]) -> bool:
@@ -404,5 +402,5 @@ def all_finite(parameters: list[nn.Parameter]) -> bool:
 
 def _interrupted(number: int) -> NoReturn:
     """End the program as a signal does, past nerfstudio, which catches KeyboardInterrupt alone."""
-    print("interrupted", file=sys.stderr)
+    say("interrupted", error=True)
     sys.exit(128 + number)

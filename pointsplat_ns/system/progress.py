@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import IO, Any, TypeVar
 
+from pointsplat_ns.errors import printable
+
 Progress = Callable[[str, float], None]
 """Called with the name of the current task and the share of it that is done, in [0, 1]."""
 
@@ -40,6 +42,7 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
         yield silent
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
@@ -60,7 +63,7 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
             if what not in tasks:
                 for task in tasks.values():
                     bar.update(task, visible=False)
-                tasks[what] = bar.add_task(what, total=1.0)
+                tasks[what] = bar.add_task(escape(printable(what)), total=1.0)
             bar.update(tasks[what], completed=share, visible=True)
 
         yield show
@@ -86,7 +89,7 @@ def _lines(stream: IO[str]) -> Progress:
             left = f", about {_clock((now - start_of_task) * (1 - share) / gained)} left"
         with suppress(OSError, ValueError):  # nobody reads any more: the work continues
             print(
-                f"[{_clock(now - start)}] {what}: {100 * share:.0f} %{left}",
+                f"[{_clock(now - start)}] {printable(what)}: {100 * share:.0f} %{left}",
                 file=stream,
                 flush=True,
             )

@@ -1,10 +1,18 @@
-"""Tables on the terminal."""
+"""What goes to the terminal: lines and tables that no name of a file can steer."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Collection, Iterable, Sequence
 
 from pointsplat_ns.errors import printable
+
+
+def say(*lines: object, error: bool = False, flush: bool = False) -> None:
+    """Print lines on standard output, or on standard error. Control characters, which are those of
+    names of files, and line breaks in a line are shown as Python writes them, such as ``\\x1b``."""
+    for line in lines:
+        print(printable(str(line)), file=sys.stderr if error else sys.stdout, flush=flush)
 
 
 def print_table(
@@ -25,8 +33,10 @@ def print_table(
     console = Console()
     if not console.is_terminal:
         console = Console(width=400)
-    table = Table(title=escape(title) or None, caption=escape(caption) or None)
-    for number, name in enumerate(header):
+    table = Table(
+        title=escape(printable(title)) or None, caption=escape(printable(caption)) or None
+    )
+    for number, name in enumerate(map(escape, map(printable, header))):
         if number in left:
             table.add_column(name, overflow="fold")
         else:

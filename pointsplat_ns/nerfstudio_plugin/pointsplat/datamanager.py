@@ -11,9 +11,9 @@ from typing import Any, Literal
 import torch
 from nerfstudio.data.datamanagers.base_datamanager import DataManager, DataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
@@ -114,9 +114,7 @@ class ScenesDataManager(DataManager):
             or "no scene (held-out photos of the training scenes serve)"
         )
         targets = "photos" if self.supervision == "photos" else "renders of the dense scenes"
-        CONSOLE.log(
-            f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}"
-        )
+        log(f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}")
         super().__init__()
 
     def _found_scenes(self, folder: Path) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
@@ -158,7 +156,7 @@ class ScenesDataManager(DataManager):
                     has_photos = False
                     missing.append(f"{run.config_path}: its data {run.data} is not there")
                     what = "left out" if chosen == "photos" else "seen from sampled poses"
-                    CONSOLE.log(f"{name} is {what}: {missing[-1]}")
+                    log(f"{name} is {what}: {missing[-1]}")
             scene = TrainedScene(name, run, self.cache, config, self.device, has_photos)
             if has_photos and chosen == "photos" and self.test_mode != "inference":
                 scene.need_photos_as_rendered("take --pipeline.datamanager.supervision dense")

@@ -20,7 +20,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import write_picture
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.system.terminal import print_table
+from pointsplat_ns.system.terminal import print_table, say
 from pointsplat_ns.system.threads import now
 
 if TYPE_CHECKING:
@@ -186,9 +186,9 @@ def print_summary(summary: dict[str, Any]) -> None:
     )
     others = [name for name, scene in scenes.items() if scene["reference"] != reference]
     if others:
-        print(f"compared with {RENDERS}, and in no mean: {', '.join(others)}")
+        say(f"compared with {RENDERS}, and in no mean: {', '.join(others)}")
     if "lpips_note" in summary:
-        print(f"no LPIPS: {summary['lpips_note']}")
+        say(f"no LPIPS: {summary['lpips_note']}")
 
 
 def only_finite(values: dict[str, Any]) -> dict[str, float]:

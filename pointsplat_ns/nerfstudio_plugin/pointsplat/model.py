@@ -15,7 +15,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.splatfacto import SplatfactoModel
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
@@ -23,6 +22,7 @@ from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.metrics import PIXEL_LOSSES, ImageError, PixelLoss, psnr
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.pipeline.trained_refiner import network_options
 from pointsplat_ns.pruning import PruneSettings
@@ -179,7 +179,7 @@ class PointSplatModel(SplatfactoModel):
                 smaller = settings.prune(dense)
             except PointSplatError as error:
                 raise type(error)(f"{scene.source}: {error}") from error
-            CONSOLE.log(f"{scene.name}: kept {len(smaller):,} of {len(dense):,} Gaussians")
+            log(f"{scene.name}: kept {len(smaller):,} of {len(dense):,} Gaussians")
             smaller = smaller.to(self.device)
             found = PrunedScene(smaller, self.refiner.prepare(smaller))
             self._cache.put(key, found)
@@ -279,7 +279,7 @@ class PointSplatModel(SplatfactoModel):
                 ImageError,
             ) as error:  # no weights, or a picture too small for the network
                 self.no_lpips_reason = str(error)
-                CONSOLE.log(f"going on without LPIPS in the loss: {error}")
+                log(f"going on without LPIPS in the loss: {error}")
         quality = torch.stack([psnr(render.detach(), photo) for render, photo in pairs]).mean()
         return outputs, losses, {"psnr": quality, "gaussian_count": len(refined)}
 

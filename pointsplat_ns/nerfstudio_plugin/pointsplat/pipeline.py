@@ -16,10 +16,10 @@ from nerfstudio.engine.callbacks import (
     TrainingCallbackLocation,
 )
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.metrics.lpips import ReportedLpips
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.pointsplat import evaluation
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import (
     ScenesDataManager,
@@ -114,7 +114,7 @@ class PointSplatPipeline(VanillaPipeline):
         self.trained_on |= set(state["trained_on"])
         gone = set(state["trained_on"]) - {scene.identity for scene in self.datamanager.scenes}
         if gone:
-            CONSOLE.log(
+            log(
                 f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} "
                 "no longer has"
             )

@@ -13,11 +13,11 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimize
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.utils.colors import get_color
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND, views_of_cameras
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache, UndistortedDataset
 from pointsplat_ns.nerfstudio_plugin.image_guard import photos_alone
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, Split
@@ -58,7 +58,7 @@ def dataparser_of(run: Run) -> DataParser:
         if name not in fields and value is not None
     ]
     if unknown:
-        CONSOLE.log(
+        log(
             f"{run.config_path}: settings that its dataparser no longer has are left out: "
             f"{', '.join(unknown)}"
         )

@@ -77,7 +77,7 @@ def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(run):
         "what was not given need not exist any more"
     )
     config.write_text(text.replace("frame_stride:", "frame_leap:"))
-    with mock.patch("pointsplat_ns.nerfstudio_plugin.pointsplat.scenes.CONSOLE.log") as log:
+    with mock.patch("pointsplat_ns.nerfstudio_plugin.console.CONSOLE.log") as log:
         assert dataparser_of(open_run(run)).config.frame_stride == 1
     assert log.call_args.args[0].endswith(
         "settings that its dataparser no longer has are left out: frame_leap"

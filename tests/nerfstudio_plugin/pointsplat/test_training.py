@@ -73,7 +73,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(three_rooms, t
     history = []
     with (
         broken("nan", {1}),
-        mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log,
+        mock.patch("pointsplat_ns.nerfstudio_plugin.console.CONSOLE.log") as log,
     ):
         trainer.setup()
         for step in range(3):

@@ -165,7 +165,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_named(started, kind, s
     assert before["gathered"]["count"].any(), "densification has gathered something"
     with (
         broken(kind, range(2, 3)),
-        mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log,
+        mock.patch("pointsplat_ns.nerfstudio_plugin.console.CONSOLE.log") as log,
     ):
         (metrics,) = take(started, [2])
     assert equal(state_of(started), before)
