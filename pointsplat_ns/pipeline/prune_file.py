@@ -9,6 +9,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
+import pointsplat_ns
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.pipeline.options import PruneOptions
 from pointsplat_ns.pipeline.photos.posed_scene import PosesFile
@@ -161,7 +164,7 @@ def prune_file(
         "resolution": list(resolution or RESOLUTION),
         "up": None if up is None else up.direction.tolist(),
         "settings": repr(MERGING),
-        "version": 2,
+        "version": [2, pointsplat_ns.__version__, torch.__version__],
     }
 
     def views(sample: Gaussians) -> Views | None:

@@ -9,8 +9,10 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
+import pointsplat_ns
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.files import one_line, write_tensors
@@ -25,7 +27,8 @@ class Unfinished:
     Args:
         path: the file; None for none. Nobody named it: a symbolic link there is not followed.
         scene: K Gaussians before the first step.
-        work: all else that the steps depend on; its text tells repairs apart.
+        work: all else that the steps depend on; its text tells repairs apart. So do the versions of
+            this package and of torch.
     """
 
     SECONDS = 60.0
@@ -35,7 +38,9 @@ class Unfinished:
         self._path = path
         self._written = time.monotonic()
         if path is not None:
-            digest = hashlib.sha256(repr(work).encode())
+            # Steps of another version may differ: the repair would be of neither.
+            versions = pointsplat_ns.__version__, torch.__version__
+            digest = hashlib.sha256(repr((versions, work)).encode())
             for value in scene.tensors():
                 digest.update(value.detach().cpu().numpy().tobytes())
             self._key = digest.hexdigest()

@@ -7,12 +7,16 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import torch
 from refusing import refusal
 
 import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.cli import main
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.pipeline import repair
+from pointsplat_ns.pipeline.repair_state import Unfinished
+from pointsplat_ns.pruning.merging.cells import Scratch
 from pointsplat_ns.system import files, outputs
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -140,8 +144,9 @@ def without_hard_links(*arguments: object, **options: object) -> None:
     raise PermissionError(1, "Operation not permitted")
 
 
-@pytest.mark.parametrize("links", [True, False], ids=["", "no hard links"])
-@pytest.mark.parametrize("name", WORK)
+@pytest.mark.parametrize(
+    ("name", "links"), [*((name, True) for name in WORK), ("room_pruned.ply", False)]
+)
 def test_a_file_that_appears_during_the_work_stays(name, links, scenes, here, capsys, monkeypatch):
     def appear(path, *_):
         if Path(path).name == Path(name).name:
@@ -219,6 +224,51 @@ def test_a_claim_that_a_killed_command_or_a_stranger_left_refuses_nothing(
     assert len(ps.load("room_pruned.ply")) == 20
     assert Path("secret").read_text() == "secret"
     assert hidden(here) == ([] if planted in ("file", "pipe") else [here / claim])
+
+
+def test_a_repair_of_another_version_does_not_continue(tmp_path, monkeypatch):
+    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)
+    scene = ball(4, opacity=1.0, bright=1.0)
+    state = dict(scene.items())
+    Unfinished(tmp_path / "state", scene, "work").save(3, lambda: state)
+    assert Unfinished(tmp_path / "state", scene, "work").state(state) is not None
+    monkeypatch.setattr(ps, "__version__", "0.0.0")
+    assert Unfinished(tmp_path / "state", scene, "work").state(state) is None
+
+
+def test_steps_in_cells_stay_after_an_error_only_if_one_was_taken(tmp_path, monkeypatch):
+    folder = tmp_path / "cells"
+    with pytest.raises(SceneError, match="needs"):
+        Scratch(folder, {}, 1 << 62)
+    assert not folder.exists()
+    with suppress(SystemExit), Scratch(folder, {}).left_if_useful():
+        raise SystemExit
+    assert not folder.exists()
+    scratch = Scratch(folder, {})
+    with suppress(SystemExit), scratch.left_if_useful():
+        scratch.make("a", lambda: {"a": torch.zeros(1)})
+        raise SystemExit
+    assert scratch.has("a")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork") or os.geteuid() != 0, reason="becomes another user")
+@pytest.mark.parametrize(
+    "check", [lambda path: files.need_writable(path, False), files.need_folder]
+)
+def test_a_folder_that_takes_no_files_of_an_ordinary_user_is_named(check, here):
+    here.chmod(0o555)
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            os.setuid(65534)
+            check(Path("out"))
+        except SceneError as error:
+            status = 0 if str(error).startswith("out: cannot be written (") else 2
+        finally:
+            os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert os.listdir() == ["damaged.ply"]
 
 
 def test_a_command_that_fails_leaves_no_folder_that_it_made(here):

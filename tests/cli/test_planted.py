@@ -14,6 +14,7 @@ from PIL import Image
 import pointsplat_ns as ps
 from making import ball, normal_scene
 from pointsplat_ns.cli import main
+from pointsplat_ns.pipeline import repair_budget
 from pointsplat_ns.pipeline.repair_state import Unfinished
 from pointsplat_ns.pruning.merging.cells import Scratch
 from pointsplat_ns.scene.discovery import FOLDER_FILES
@@ -186,6 +187,7 @@ def secret(tmp_path, monkeypatch) -> Path:
 @pytest.mark.parametrize("name", LINKS)
 def test_nothing_is_written_or_removed_through_a_link_that_nobody_named(name, secret, monkeypatch):
     monkeypatch.setattr(Unfinished, "SECONDS", 0.0)  # the state of a repair is written at once
+    monkeypatch.setitem(repair_budget.STEPS, "quick", 4)
     link = Path(name)
     link.parent.mkdir(parents=True, exist_ok=True)
     link.symlink_to(secret)
