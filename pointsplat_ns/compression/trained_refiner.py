@@ -175,9 +175,9 @@ def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
 def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The network options in a run's model settings, as changes to the preset of its size. Runs of
     earlier versions lack the later ones."""
-    later = ("enc_depths", "stem", "raw_inputs", "means_reach")
+    later = ("enc_depths", "stem", "raw_inputs", "means_reach", "units", "norm")
     return {
-        **{name: settings[name] for name in ("encoder", "use_appearance", "use_position", "norm")},
+        **{name: settings[name] for name in ("encoder", "use_appearance", "use_position")},
         **{name: settings[name] for name in later if settings.get(name) is not None},
     }
 

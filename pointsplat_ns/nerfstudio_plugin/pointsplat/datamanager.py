@@ -18,7 +18,9 @@ from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys, shown_sc
 from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import ScenePiece, cut_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
+from pointsplat_ns.pruning import PruneSettings
 
 
 @dataclass
@@ -41,6 +43,17 @@ class ScenesDataManagerConfig(DataManagerConfig):
     out in addition."""
     sampled_size: tuple[int, int] = (320, 240)
     """Width and height, in pixels, of renders from sampled poses."""
+    pieces: int = 0
+    """Train on pieces of at most so many Gaussians, cut from the training scenes by planes, in
+    place of whole scenes: many small scenes teach more than few large ones. Needs supervision by
+    dense renders, which pieces have alone. 0 trains on whole scenes."""
+    cuts: int = 1
+    """Number of different cuts of each scene into pieces; each further cut makes pieces of two
+    thirds of the size."""
+    piece_poses: int = 12
+    """Number of poses sampled for each piece."""
+    pieces_folder: Path | None = None
+    """Keep the poses and renders of pieces there, for later trainings on the same pieces."""
     eval_scenes: tuple[str, ...] = ()
     """Names of scenes never to train on, to evaluate the refiner on unseen scenes."""
     images_per_step: int = 2
@@ -88,6 +101,9 @@ class ScenesDataManager(DataManager):
                 "x 1"
             )
         self._pixels = 0
+        self._usable: dict[int, bool] = {}
+        self.prune_settings: tuple[PruneSettings, ...] = ()
+        """How the model prunes scenes: pieces of which too little is left are not trained on."""
         self.cache = MemoryCache.of(config.cache_gigabytes)
         self.supervision, self.scenes = self._found_scenes(Path(config.data))
         names = [scene.name for scene in self.scenes]
@@ -108,7 +124,12 @@ class ScenesDataManager(DataManager):
             )
         self.shown = names.index(shown_scene(names, config.eval_scenes))
         """The scene that the viewer and the exporter get."""
-        training = ", ".join(names[i] for i in self.train_indices)
+        self.training_names = [names[i] for i in self.train_indices]
+        training = ", ".join(self.training_names)
+        self.whole_scenes = len(self.scenes)
+        """Number of scenes; pieces of them follow these in ``scenes``."""
+        if config.pieces and test_mode == "val":
+            training = self._cut()
         held_out = (
             ", ".join(config.eval_scenes)
             or "no scene (held-out photos of the training scenes serve)"
@@ -176,6 +197,28 @@ class ScenesDataManager(DataManager):
             )
         return chosen, scenes
 
+    def _cut(self) -> str:
+        """Train on pieces of the training scenes; what they are, for the log. Raises DataError if
+        they cannot be trained on."""
+        config = self.config
+        if self.supervision != "dense":
+            raise DataError(
+                f"--pipeline.datamanager.pieces {config.pieces}: photos show whole scenes; expected "
+                "--pipeline.datamanager.supervision dense"
+            )
+        if min(config.pieces, config.cuts, config.piece_poses) < 1:
+            raise DataError(
+                f"{config.cuts} cuts into pieces of {config.pieces} Gaussians with "
+                f"{config.piece_poses} poses: expected at least 1 of each"
+            )
+        whole = [self.scenes[i] for i in self.train_indices]
+        pieces = cut_scenes(whole, config)
+        if not pieces:
+            raise SceneError(f"{config.data}: no scene is large enough to train on")
+        self.train_indices = list(range(len(self.scenes), len(self.scenes) + len(pieces)))
+        self.scenes += pieces
+        return f"{len(pieces)} pieces of {', '.join(scene.name for scene in whole)}"
+
     @property
     def train_dataset(self) -> InputDataset | None:  # type: ignore[override]
         """Training photos of the shown scene, for the viewer."""
@@ -205,12 +248,29 @@ class ScenesDataManager(DataManager):
         return step * self.world_size + self.local_rank
 
     def scene_at(self, step: int) -> int:
-        """Index of the scene of a step. Each scene comes once before any is repeated."""
+        """Index of the scene of a step. Each scene comes once before any is repeated. A piece that
+        cannot be trained on is logged, and another takes its place."""
         epoch, place = divmod(self.place(step), len(self.train_indices))
         order = random.Random(f"{self.config.seed} scenes {epoch}").sample(
             self.train_indices, len(self.train_indices)
         )
-        return order[place]
+        for index in order[place:] + order[:place]:
+            if self._can_train_on(index):
+                return index
+        raise SceneError(f"{self.config.data}: no piece of its scenes can be trained on")
+
+    def _can_train_on(self, index: int) -> bool:
+        """Whether a scene, by its index, is whole, or a piece that can be seen and of which
+        something is kept. Pieces that are not are logged once."""
+        piece = self.scenes[index]
+        if not isinstance(piece, ScenePiece):
+            return True
+        if index not in self._usable:
+            why = piece.why_not(self.prune_settings)
+            if why:
+                CONSOLE.log(f"{piece.name} is left out: {why}")
+            self._usable[index] = not why
+        return self._usable[index]
 
     def next_train(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
         """Index of a training scene, and some of its training photos with their cameras, on this
