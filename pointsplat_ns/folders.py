@@ -174,7 +174,7 @@ def compact_folder(
     folder = Path(folder)
     target = output_folder(folder) if output is None else Path(output)
     size = parse_resolution(resolution)
-    trained = None if refiner is None else _loaded(refiner)
+    trained = None if refiner is None else _loaded(refiner, by=by)
     request = CompactRequest.of(
         trained, keep, by, sh, clean, RepairBudget(effort, seconds), target_db=target_db
     )
@@ -336,7 +336,7 @@ class _Compacting:
         kind = format_to_write(task.output)
         source = view_source(dense, run=task.source, data=self.data, resolution=self.resolution)
         prune = dataclasses.replace(self.request.prune, suffix=kind.suffix)
-        trained = None if self.refiner is None else _loaded(self.refiner)
+        trained = None if self.refiner is None else _loaded(self.refiner, by=prune.by)
         request = dataclasses.replace(self.request, prune=prune, refiner=trained)
         made = (compact_to_psnr if request.searched else compact_scene)(dense, request, source)
         if made.interrupted:

@@ -189,7 +189,7 @@ def compact(
     options.check_outputs(output, force, picture, html)
     budget = RepairBudget(effort, seconds)
     suffix = format_to_write(output).suffix
-    trained = None if refiner is None else ps.load_refiner(refiner)
+    trained = None if refiner is None else ps.load_refiner(refiner, by=by)
     request = CompactRequest.of(
         trained, keep, by, sh, clean, budget, bool(photos), suffix, target_db
     )

@@ -75,7 +75,8 @@ def compact_scene(
         Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)
     ]
     if request.refiner is not None:
-        stages.append(_refined(stages[0], request.refiner, judge, uncompared, progress))
+        kept = len(pruned.scene) / max(1, len(dense))
+        stages.append(_refined(stages[0], request.refiner, kept, judge, uncompared, progress))
     left = last_kept(stages)
     comparable = left.after is not None and left.after.psnr < math.inf and not request.repair.empty
     repairing = judge if comparable else None
@@ -120,13 +121,15 @@ def compact_scene(
 def _refined(
     last: Stage,
     refiner: TrainedRefiner,
+    kept: float,
     judge: Comparison | None,
     uncompared: str,
     progress: Progress,
 ) -> Stage:
-    """The refinement of the last stage by a network."""
+    """The refinement of the last stage, which holds the share ``kept`` of the dense scene, by a
+    network."""
     progress("refining", 0.0)
-    refined = refiner(last.scene)
+    refined = refiner(last.scene, kept)
     unsound = int((last.scene.usable() & ~refined.usable()).sum())
     if unsound:
         return Stage(

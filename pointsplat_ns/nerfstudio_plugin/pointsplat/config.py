@@ -16,6 +16,7 @@ from tyro.conf import Fixed, Suppress
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import take_network_of
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
@@ -64,6 +65,10 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     """Largest norm of all gradients together, in place of each optimiser's max-norm for its own
     part."""
 
+    init: str | None = None
+    """Start from the weights of a trained refiner, and take the options of its network: shipped,
+    which has one for merging and one for selections, a .safetensors file, or a run."""
+
     steps_per_eval_batch: Suppress[Fixed[int]] = 0  # nerfstudio's, without effect here
 
     def set_timestamp(self) -> None:
@@ -76,6 +81,8 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
                 "that are started by "
                 f"torchrun --nproc-per-node {number} --no-python ns-train {self.method_name}"
             )
+        if self.init is not None:
+            take_network_of(self.init, self.pipeline.model)
         super().set_timestamp()
         connect_torchrun("nccl" if kind == "cuda" else "gloo")
 

@@ -18,7 +18,11 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from pointsplat_ns.compression.trained_refiner import network_options
+from pointsplat_ns.compression.trained_refiner import (
+    NETWORK_OPTIONS,
+    load_refiner,
+    network_options,
+)
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
@@ -95,6 +99,9 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Network of LPIPS in the training loss. auto is vgg on CUDA, and elsewhere alex, which is
     thirty times cheaper."""
 
+    init: str | None = None
+    """Weights to start from; set by --init, which takes the options of that network, too."""
+
     sh_degree: ClassVar[int] = 3
     """Read by ``ns-export``: above 0, colours are SH coefficients. A scene may have any degree."""
 
@@ -102,6 +109,22 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
         """How scenes are pruned; ``keep`` is the config's own by default. Raises PointSplatError if
         the settings fit no scene."""
         return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
+
+
+def take_network_of(init: str, config: PointSplatModelConfig) -> None:
+    """Start from a trained refiner (``shipped``, a file or a run): set the config to the options of
+    its network. Raises WeightsError or SceneError if there is no such refiner, and SceneError if no
+    options give its network."""
+    trained = load_refiner(init, "cpu", config.by)
+    for name in ("size", *NETWORK_OPTIONS):
+        if name in trained.options:
+            setattr(config, name, trained.options[name])
+    if preset(config.size, **network_options(vars(config))) != trained.network.config:
+        raise SceneError(
+            f"--init {init}: no options of ns-train give its network; expected one that ns-train "
+            "pointsplat trained"
+        )
+    config.init = init
 
 
 class PrunedScene(NamedTuple):
@@ -128,10 +151,13 @@ class PointSplatModel(SplatfactoModel):
                 f"--pipeline.model.lpips-weight {config.lpips_weight:g}: expected a finite "
                 "number, 0 or above"
             )
+        manager: ScenesDataManager = self.kwargs["datamanager"]
         self.refiner = Refiner(preset(config.size, **network_options(vars(config))))
+        if config.init is not None and manager.test_mode == "val":
+            trained = load_refiner(config.init, "cpu", config.by)
+            self.refiner.load_state_dict(trained.network.state_dict())
         self.refiner.encoder.requires_grad_(config.train_encoder)
         self.crop_box: OrientedBox | None = None
-        manager: ScenesDataManager = self.kwargs["datamanager"]
         manager.prune_settings = tuple(
             config.prune_settings(keep) for keep in (config.keep, *config.more_keeps)
         )

@@ -34,6 +34,12 @@ from pointsplat_ns.system import processes
 
 MODEL_METADATA = (
     "size",
+    "encoder",
+    "use_appearance",
+    "use_position",
+    "enc_depths",
+    "stem",
+    "raw_inputs",
     "by",
     "keep",
     "more_keeps",
