@@ -67,10 +67,7 @@ def measured(
         SELECTION: lambda: small,
         CONSTANT: lambda: max(grown.values(), key=dense.psnr),
         MERGED: lambda: ps.prune(scene.dense, keep=share, by="merge"),
-        **{
-            name: functools.partial(refiner, small, kept)
-            for name, refiner in networks.items()
-        },
+        **{name: functools.partial(refiner, small, kept) for name, refiner in networks.items()},
     }
     rows: list[Row] = []
     for way in ways:

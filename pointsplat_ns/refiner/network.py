@@ -165,7 +165,10 @@ class DualBranchEncoder(nn.Module):
                     linear(hidden, reduced),
                 )
             self.appearance = nn.Sequential(
-                linear(appearance + reduced, dim), norm(dim), nn.ReLU(inplace=True), linear(dim, dim)
+                linear(appearance + reduced, dim),
+                norm(dim),
+                nn.ReLU(inplace=True),
+                linear(dim, dim),
             )
 
     def forward(self, features: Features | LocalFeatures) -> Tensor:

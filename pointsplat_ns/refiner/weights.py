@@ -30,7 +30,6 @@ def shipped_refiner(by: str = "merge") -> Path:
     return SHIPPED_REFINER if by == "merge" else SHIPPED_FOR_SELECTIONS
 
 
-
 class WeightsError(PointSplatError):
     """A file without a usable refiner."""
 

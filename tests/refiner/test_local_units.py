@@ -118,9 +118,7 @@ def test_residuals_are_bounded():
         refiner.heads.mlps["means"][-1].bias.fill_(100.0)
         refiner.heads.mlps["scales"][-1].bias.fill_(-100.0)
     refined = refiner(scene)
-    unit = torch.minimum(
-        local_units(scene).unit, FEWEST_SIZES * scene.stds.amax(dim=1)
-    )
+    unit = torch.minimum(local_units(scene).unit, FEWEST_SIZES * scene.stds.amax(dim=1))
     assert torch.allclose(refined.means - scene.means, (0.25 * unit)[:, None].expand(-1, 3))
     assert torch.allclose(scene.scales - refined.scales, torch.tensor(SCALES_REACH).double())
 

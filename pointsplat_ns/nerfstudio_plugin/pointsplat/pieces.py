@@ -203,9 +203,7 @@ class RenderedPiece(RenderedDataset):
         return Path(poses.pieces_folder) / f"{digest}.safetensors"
 
 
-def cut_scenes(
-    scenes: Sequence[DenseScene], config: ScenesDataManagerConfig
-) -> list[ScenePiece]:
+def cut_scenes(scenes: Sequence[DenseScene], config: ScenesDataManagerConfig) -> list[ScenePiece]:
     """The pieces of scenes, by ``pieces`` and ``cuts`` of the datamanager's configuration. Scenes
     that cannot be read or are too small are logged and left out."""
     found: list[ScenePiece] = []
