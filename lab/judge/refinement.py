@@ -40,12 +40,11 @@ HEADS = ("kept", "way", "PSNR, dB", "over the selection", "worst scene", "over t
 
 PAGE = """# What one pass of a network brings over a selection
 
-`lab/judge/refinement.py` measured [{name}]({name}) and writes this page from it. PSNR against renders of the dense scene
-over the pixels that it covers, in {views} views of camera paths written by hand, {width} pixels wide. The best constant is
-one number added to all log-scales, chosen for each scene and budget by these same views: a control that knows the answer.
-The worst scene is named where a way gains least over the selection. What is said here holds for these scenes at this width.
-
-Trained on none of these scenes: {unseen}.
+`lab/judge/refinement.py` measured [{name}]({name}) and writes this page from it. PSNR is against renders of the dense
+scene, over the pixels that it covers, in {views} views of camera paths written by hand, {width} pixels wide. The best
+constant is one number added to all log-scales, chosen for each scene and budget by these same views: a control that
+knows the answer. The worst scene is the one where a way gains least over the selection. The figures hold for these
+scenes at this width; no network was trained on them.
 
 """
 
@@ -127,8 +126,7 @@ def each_scene(rows: list[Row]) -> str:
 
 def page(rows: list[Row], name: str, views: int, width: int) -> str:
     """The Markdown page of all rows."""
-    unseen = ", ".join(grouped(rows, lambda row: row["scene"]))
-    head = PAGE.format(name=name, views=views, width=width, unseen=unseen)
+    head = PAGE.format(name=name, views=views, width=width)
     return head + markdown(HEADS, lines(rows)) + "\n\n" + each_scene(rows) + "\n"
 
 

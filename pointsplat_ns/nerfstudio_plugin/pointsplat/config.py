@@ -82,6 +82,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
                 f"torchrun --nproc-per-node {number} --no-python ns-train {self.method_name}"
             )
         if self.init is not None:
+            assert isinstance(self.pipeline, PointSplatPipelineConfig)
             take_network_of(self.init, self.pipeline.model)
         super().set_timestamp()
         connect_torchrun("nccl" if kind == "cuda" else "gloo")

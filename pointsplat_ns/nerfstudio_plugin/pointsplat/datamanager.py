@@ -18,7 +18,12 @@ from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys, shown_sc
 from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
-from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import ScenePiece, cut_scenes
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import (
+    PIECES,
+    ScenePiece,
+    count_of,
+    cut_scenes,
+)
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 from pointsplat_ns.pruning import PruneSettings
 
@@ -43,10 +48,10 @@ class ScenesDataManagerConfig(DataManagerConfig):
     out in addition."""
     sampled_size: tuple[int, int] = (320, 240)
     """Width and height, in pixels, of renders from sampled poses."""
-    pieces: int = 0
-    """Train on pieces of at most so many Gaussians, cut from the training scenes by planes, in
-    place of whole scenes: many small scenes teach more than few large ones. Needs supervision by
-    dense renders, which pieces have alone. 0 trains on whole scenes."""
+    pieces: int | None = None
+    """Cut larger training scenes by planes into pieces of at most so many Gaussians, and train on
+    these: many small scenes teach more than few large ones. A piece has its own renders, so this
+    needs dense supervision, where it is 12000 by default. 0 trains on whole scenes."""
     cuts: int = 1
     """Number of different cuts of each scene into pieces; each further cut makes pieces of two
     thirds of the size."""
@@ -128,8 +133,11 @@ class ScenesDataManager(DataManager):
         training = ", ".join(self.training_names)
         self.whole_scenes = len(self.scenes)
         """Number of scenes; pieces of them follow these in ``scenes``."""
-        if config.pieces and test_mode == "val":
-            training = self._cut()
+        pieces = config.pieces
+        if pieces is None:
+            pieces = PIECES if self.supervision == "dense" else 0
+        if pieces and test_mode == "val":
+            training = self._cut(pieces)
         held_out = (
             ", ".join(config.eval_scenes)
             or "no scene (held-out photos of the training scenes serve)"
@@ -197,27 +205,35 @@ class ScenesDataManager(DataManager):
             )
         return chosen, scenes
 
-    def _cut(self) -> str:
-        """Train on pieces of the training scenes; what they are, for the log. Raises DataError if
-        they cannot be trained on."""
+    def _cut(self, most: int) -> str:
+        """Train on pieces of at most ``most`` Gaussians of the training scenes that have more; what
+        is trained on, for the log. Raises DataError if pieces cannot be trained on, SceneError if
+        nothing can."""
         config = self.config
         if self.supervision != "dense":
             raise DataError(
-                f"--pipeline.datamanager.pieces {config.pieces}: photos show whole scenes; expected "
+                f"--pipeline.datamanager.pieces {most}: photos show whole scenes; expected "
                 "--pipeline.datamanager.supervision dense"
             )
-        if min(config.pieces, config.cuts, config.piece_poses) < 1:
+        if min(most, config.cuts, config.piece_poses) < 1:
             raise DataError(
-                f"{config.cuts} cuts into pieces of {config.pieces} Gaussians with "
-                f"{config.piece_poses} poses: expected at least 1 of each"
+                f"{config.cuts} cuts into pieces of {most} Gaussians with {config.piece_poses} "
+                "poses: expected at least 1 of each"
             )
-        whole = [self.scenes[i] for i in self.train_indices]
-        pieces = cut_scenes(whole, config)
-        if not pieces:
-            raise SceneError(f"{config.data}: no scene is large enough to train on")
-        self.train_indices = list(range(len(self.scenes), len(self.scenes) + len(pieces)))
+        large, small = [], []
+        for index in self.train_indices:
+            count = count_of(self.scenes[index])
+            if count is not None:
+                (large if count > most else small).append(index)
+        pieces = cut_scenes([self.scenes[i] for i in large], most, config)
+        self.train_indices = small + list(range(len(self.scenes), len(self.scenes) + len(pieces)))
+        if not self.train_indices:
+            raise SceneError(f"{config.data}: none of its scenes can be trained on")
+        self.training_names = [self.scenes[i].name for i in sorted(large + small)]
+        whole = [self.scenes[i].name for i in small]
+        cut = [f"{len(pieces)} pieces of {', '.join(self.scenes[i].name for i in large)}"]
         self.scenes += pieces
-        return f"{len(pieces)} pieces of {', '.join(scene.name for scene in whole)}"
+        return ", ".join(whole + (cut if pieces else []))
 
     @property
     def train_dataset(self) -> InputDataset | None:  # type: ignore[override]

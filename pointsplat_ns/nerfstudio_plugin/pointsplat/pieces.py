@@ -28,8 +28,8 @@ from pointsplat_ns.refiner.scene_cut import SceneCut, cut_scene
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 
-FEWEST = 500
-"""Gaussians of the smallest piece that is trained on."""
+PIECES = 12000
+"""Largest number of Gaussians of a piece by default."""
 
 FEWEST_LEFT = 32
 """Gaussians of the smallest pruned piece that is trained on."""
@@ -39,11 +39,12 @@ PIECE_FORMAT = "pointsplat-piece/1"
 
 @dataclass(frozen=True, eq=False)
 class CutScene:
-    """A dense scene and one cut of it."""
+    """A dense scene and one cut of it, of several that begin with pieces of ``most`` Gaussians."""
 
     whole: DenseScene
     cut: SceneCut
     seed: int
+    most: int
 
     def members(self, number: int) -> Tensor:
         """Indices of the dense scene's Gaussians in a piece. # [n] int64"""
@@ -197,34 +198,39 @@ class RenderedPiece(RenderedDataset):
         assert poses is not None
         if poses.pieces_folder is None:
             return None
-        settings = (poses.piece_poses, poses.sampled_size, poses.seed, poses.pieces)
+        settings = (poses.piece_poses, poses.sampled_size, poses.seed, piece.of.most)
         text = f"{piece.identity} {piece.of.seed} {piece.number} {settings}"
         digest = hashlib.sha256(text.encode()).hexdigest()[:24]
         return Path(poses.pieces_folder) / f"{digest}.safetensors"
 
 
-def cut_scenes(scenes: Sequence[DenseScene], config: ScenesDataManagerConfig) -> list[ScenePiece]:
-    """The pieces of scenes, by ``pieces`` and ``cuts`` of the datamanager's configuration. Scenes
-    that cannot be read or are too small are logged and left out."""
+def count_of(scene: DenseScene) -> int | None:
+    """Number of Gaussians of a training scene; None, and a line in the log, if it cannot be read or
+    none of them can be drawn."""
+    try:
+        usable = scene.dense(keep=True).usable()
+    except PointSplatError as error:
+        CONSOLE.log(f"{scene.name} is left out: {error}")
+        return None
+    if not bool(usable.any()):
+        CONSOLE.log(f"{scene.name} is left out: none of its Gaussians can be drawn")
+        return None
+    return len(usable)
+
+
+def cut_scenes(
+    scenes: Sequence[DenseScene], most: int, config: ScenesDataManagerConfig
+) -> list[ScenePiece]:
+    """The pieces of readable scenes, of at most ``most`` Gaussians, in all cuts of the datamanager's
+    configuration. Each further cut has pieces of two thirds of the size."""
     found: list[ScenePiece] = []
     for scene in scenes:
-        try:
-            dense = scene.dense(keep=True)
-        except PointSplatError as error:
-            CONSOLE.log(f"{scene.name} is left out: {error}")
-            continue
-        usable = dense.usable()
-        if int(usable.sum()) < FEWEST:
-            CONSOLE.log(
-                f"{scene.name} is left out: {int(usable.sum()):,} Gaussians; expected at least "
-                f"{FEWEST:,} to learn from"
-            )
-            continue
+        dense = scene.dense(keep=True)
+        means = dense.means[dense.usable()]
         for number in range(config.cuts):
             seed = random.Random(f"{config.seed} cut {number}").getrandbits(31)
-            # Cuts of other sizes are other pieces, too.
-            most = max(FEWEST, round(config.pieces * (2 / 3) ** number))
-            cut = CutScene(scene, cut_scene(dense.means[usable], most, seed), seed)
+            size = max(1, round(most * (2 / 3) ** number))
+            cut = CutScene(scene, cut_scene(means, size, seed), seed, most)
             found += [ScenePiece(cut, piece, config) for piece in range(cut.cut.count)]
     return found
 

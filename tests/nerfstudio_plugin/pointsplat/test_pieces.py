@@ -19,8 +19,7 @@ from pointsplat_ns.refiner import WeightsError, read_refiner, save_refiner
 
 
 @pytest.fixture(autouse=True)
-def small_pieces_count(monkeypatch):
-    monkeypatch.setattr(pieces, "FEWEST", 100)
+def few_are_enough(monkeypatch):
     monkeypatch.setattr(pieces, "FEWEST_LEFT", 8)
 
 
@@ -106,21 +105,29 @@ def test_renders_of_a_piece_are_composited_over_any_background(three_rooms):
     assert (drawn - composited).abs().max() < 1.5 / 255
 
 
-def test_what_is_too_small_or_not_seen_is_left_out_in_one_line(tmp_path):
+def test_what_is_not_seen_is_left_out_in_one_line_and_what_is_small_stays_whole(tmp_path):
+    room = box_room(2)
     write_ply(box_room(0), tmp_path / "room.ply")
     write_ply(box_room(1)[:50], tmp_path / "few.ply")
-    room = box_room(2)
     write_ply(room.replace(opacities=room.opacities - 1e3), tmp_path / "clear.ply")
+    write_ply(room.replace(means=room.means * torch.nan), tmp_path / "broken.ply")
     with mock.patch.object(pieces.CONSOLE, "log") as log:
         manager = manager_of(tmp_path)
-    said = [str(call.args[0]) for call in log.call_args_list]
-    assert said[0].startswith("few is left out: 50 Gaussians; expected at least 100")
-    module = "pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager.CONSOLE"
-    with mock.patch(f"{module}.log") as log:
-        scenes = {manager.scenes[manager.scene_at(step)].of.whole.name for step in range(12)}
-    assert scenes == {"room"}
-    said = [str(call.args[0]) for call in log.call_args_list]
-    assert said and all(text.startswith("clear/") and "\n" not in text for text in said)
+        names = {manager.scenes[manager.scene_at(step)].name.split("/")[0] for step in range(15)}
+    assert names == {"room", "few"}
+    said = [str(call.args[0]) for call in log.call_args_list if "left out" in str(call.args[0])]
+    assert said[0].startswith("broken is left out")
+    assert len(said) > 1 and all(text.startswith("clear/") for text in said[1:])
+    assert not any("\n" in text for text in said)
+
+
+def test_scenes_are_cut_by_default_where_renders_are_the_targets(three_rooms, monkeypatch):
+    module = "pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager.PIECES"
+    with mock.patch(module, 300):
+        cut = manager_of(three_rooms, pieces=None)
+        whole = manager_of(three_rooms, pieces=0)
+    assert len(cut.train_indices) == 12 and cut.training_names == ["room0", "room1", "room2"]
+    assert whole.train_indices == [0, 1, 2]
 
 
 def test_pieces_are_refused_where_they_mean_nothing(trained_walls, three_rooms):
