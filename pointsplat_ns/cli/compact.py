@@ -132,7 +132,7 @@ def compact(
     alone = purpose.page and html is None
     html = unnamed(output.with_suffix(".html")) if alone else html
     options.check_outputs(output, force, picture, html)
-    refiner = None if how.refiner is None else ps.load_refiner(how.refiner)
+    refiner = None if how.refiner is None else ps.load_refiner(how.refiner, by=how.by or None)
     how = replace(how, target_format=format_to_write(output).suffix)
     state_file = output.with_name(f".{output.name}.unfinished")
     done = run.compact(scene, how, refiner, state_file=state_file, progress=True)

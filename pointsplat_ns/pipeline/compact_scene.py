@@ -87,7 +87,8 @@ def compact_scene(
         )
     ]
     if refiner is not None:
-        results.append(Refine(refiner).run(results[0], context))
+        share = len(pruned.scene) / max(1, len(dense))
+        results.append(Refine(refiner, share).run(results[0], context))
     results += _repaired(last_accepted(results), options, context, photos, state_file)
     if pruned.limit is not None:
         last = last_accepted(results)

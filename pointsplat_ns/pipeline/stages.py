@@ -58,10 +58,12 @@ class Refine:
     """One forward pass of a trained network."""
 
     refiner: TrainedRefiner
+    share: float
+    """Share of the dense scene's Gaussians that the pruned scene holds."""
 
     def run(self, last: StageResult, context: Context) -> StageResult:
         context.progress("refining", 0.0)
-        refined = self.refiner(last.scene)
+        refined = self.refiner(last.scene, self.share)
         unsound = int((last.scene.usable() & ~refined.usable()).sum())
         if unsound:
             reason = Reason(Cause.NOT_FINITE, count=unsound, total=len(refined))

@@ -6,7 +6,7 @@ Reading needs no nerfstudio and does not execute a run's ``config.yml``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.pipeline.options import default_device
 from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refinement import Refiner, WeightsError, preset, read_metadata, read_refiner
-from pointsplat_ns.refinement.weights import SHIPPED_REFINER
+from pointsplat_ns.refinement.weights import shipped_refiner
 from pointsplat_ns.scene.checkpoints import load_checkpoint
 from pointsplat_ns.scene.discovery import find_runs_and_plys, shown_scene
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -39,15 +39,24 @@ class TrainedRefiner:
     network: Refiner
     settings: PruneSettings
     source: Path
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """The options of ``ns-train pointsplat`` that the network was built with, as far as known."""
 
     @torch.no_grad()
-    def __call__(self, scene: Gaussians) -> Gaussians:
+    def __call__(self, scene: Gaussians, kept: float | None = None) -> Gaussians:
         """The refined scene, on the device of the given one.
+
+        Args:
+            scene: K Gaussians.
+            kept: share of the dense scene's Gaussians that these are, in (0, 1]; by default that of
+                the training if it is a share, else a tenth.
 
         Raises:
             SceneError: if the SH degree exceeds the network's.
         """
-        return self.network(scene.to(self.device)).to(scene.device)
+        if kept is None:
+            kept = self.settings.keep if self.settings.keep <= 1 else 0.1
+        return self.network(scene.to(self.device), kept=kept).to(scene.device)
 
     @property
     def device(self) -> torch.device:
@@ -56,15 +65,18 @@ class TrainedRefiner:
 
 
 def load_refiner(
-    path: Path | str | None = None, device: torch.device | str | None = None
+    path: Path | str | None = None,
+    device: torch.device | str | None = None,
+    by: str | None = None,
 ) -> TrainedRefiner:
     """Load a trained refiner.
 
     Args:
         path: a ``.safetensors`` file, or a ``pointsplat`` run (its folder, ``config.yml`` or
-            checkpoint); by default or for "shipped" the one that ships
-            (``pointsplat_ns/refinement/pretrained/CARD.md`` describes its training).
+            checkpoint); by default or for "shipped" the one that ships for the method ``by``
+            (the pages in ``pointsplat_ns/refinement/pretrained`` describe their training).
         device: device of the network; by default CUDA if available, else the CPU.
+        by: the pruning method that a shipped refiner is for; by default "merge".
 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
@@ -78,20 +90,21 @@ def load_refiner(
     """
     device = default_device() if device is None else device
     shipped = path is None or str(path) == "shipped"
-    if shipped and not SHIPPED_REFINER.is_file():
+    path = shipped_refiner(by or "merge") if path is None or shipped else Path(path)
+    if shipped and not path.is_file():
         raise WeightsError(
-            f"{SHIPPED_REFINER}: the refiner that ships is not there; install the package again, "
-            "or name another (--refiner RUN_OR_FILE)"
+            f"{path}: the refiner that ships is not there; install the package again, or name "
+            "another (--refiner RUN_OR_FILE)"
         )
-    path = SHIPPED_REFINER if path is None or shipped else Path(path)
     kind = path.suffix.lower()
+    options: Mapping[str, Any]
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise WeightsError(
             f"{path}: not a regular file; expected a trained pointsplat run or a .safetensors file"
         )
     if kind == ".safetensors":
         network = read_refiner(path)
-        metadata = read_metadata(path)
+        metadata = options = read_metadata(path)
         try:
             settings = settings_from({"keep": 0.1, "by": "merge", **metadata})
         except (PointSplatError, KeyError, TypeError, ValueError, OverflowError) as error:
@@ -104,11 +117,15 @@ def load_refiner(
             "or config.yml), or a .safetensors file"
         )
     else:
-        network, settings = _read_run(open_refiner_run(path, need_data=False))
-    return TrainedRefiner(network.to(device).eval(), settings, path)
+        run = open_refiner_run(path, need_data=False)
+        network, settings = _read_run(run)
+        options = run.model_fields
+    return TrainedRefiner(network.to(device).eval(), settings, path, options)
 
 
-def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians:
+def refine(
+    scene: Gaussians, refiner: TrainedRefiner | None = None, kept: float | None = None
+) -> Gaussians:
     """Refine a pruned scene by one forward pass of a trained network.
 
     The network was trained on scenes pruned with ``refiner.settings``.
@@ -117,6 +134,8 @@ def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians
     Args:
         scene: K Gaussians.
         refiner: from :func:`load_refiner`; by default the shipped one.
+        kept: share of the dense scene's Gaussians that these are, in (0, 1], for networks that
+            refine scenes of several budgets; by default that of the training.
 
     Returns:
         K Gaussians on the device of the given scene.
@@ -130,7 +149,7 @@ def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians
         >>> len(ps.refine(small, ps.load_refiner())) == len(small)
         True
     """
-    return (refiner or load_refiner())(scene)
+    return (refiner or load_refiner())(scene, kept)
 
 
 def open_refiner_run(path: Path | str, need_data: bool, data: Path | str | None = None) -> Run:
@@ -172,13 +191,18 @@ def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
     )
 
 
+LATER_OPTIONS = ("enc_depths", "stem", "raw_inputs", "means_reach", "units", "norm")
+"""Network options that runs of earlier versions lack, or that None leaves to the size."""
+
+NETWORK_OPTIONS = ("encoder", "use_appearance", "use_position", *LATER_OPTIONS)
+"""Options of ``ns-train pointsplat``, beside the size, that networks are built with."""
+
+
 def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The network options in a run's model settings, as changes to the preset of its size. Runs of
-    earlier versions lack the later ones."""
-    later = ("enc_depths", "stem", "raw_inputs", "means_reach")
+    """The network options in a run's model settings, as changes to the preset of its size."""
     return {
-        **{name: settings[name] for name in ("encoder", "use_appearance", "use_position", "norm")},
-        **{name: settings[name] for name in later if settings.get(name) is not None},
+        **{name: settings[name] for name in ("encoder", "use_appearance", "use_position")},
+        **{name: settings[name] for name in LATER_OPTIONS if settings.get(name) is not None},
     }
 
 

@@ -12,7 +12,8 @@ from pointsplat_ns.scene.gaussians import MAX_SH_DEGREE
 
 _NAMES = {
     "encoder": ("dual", "concat"),
-    "norm": ("scene", "batch"),
+    "norm": ("scene", "batch", "layer"),
+    "units": ("scene", "local"),
     "stem": ("conv", "linear"),
     "curves": ("z", "z-trans", "hilbert", "hilbert-trans"),
 }
@@ -88,16 +89,21 @@ class RefinerConfig:
     curves: tuple[str, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
     """Serialization curves; block i of a stage uses curve i (shuffled in training). Memory is laid
     out by the first."""
-    norm: Literal["scene", "batch"] = "scene"
+    norm: Literal["scene", "batch", "layer"] = "scene"
     """Normalisation outside the attention blocks, by each channel's mean and variance over the
     points of the current scene. In evaluation the published ``batch`` uses running averages over
-    scenes, which fit no single scene."""
+    scenes, which fit no single scene. ``layer`` normalises each point by itself, so that its result
+    does not depend on what else the scene holds."""
+    units: Literal["scene", "local"] = "scene"
+    """Unit of positions, sizes and their residuals: the scene's extent (published), or ``local``,
+    the distance to the nearest neighbours, for which the encoder is given statistics of these and
+    the share of the Gaussians that was kept."""
     head_width: int = 128
     head_depth: int = 4
     """Hidden width and number of linear layers of each output head."""
     means_reach: float = 0.05
     """Largest move of a mean along an axis, as a share of the scene's extent (1.0 in the published
-    code)."""
+    code), or in local units."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -133,6 +139,11 @@ class RefinerConfig:
             self.encoder == "dual" or (self.use_appearance and self.use_position),
             "use_appearance and use_position are switches of the encoder 'dual'; encoder 'concat' "
             "expects both on",
+        )
+        _require(
+            self.encoder == "dual" or self.units == "scene",
+            "units is local, which the encoder 'concat' does not take; expected scene, or the "
+            "encoder 'dual'",
         )
 
     @property
@@ -207,7 +218,8 @@ def preset(name: str, **changes: Any) -> RefinerConfig:
     """
     if name not in PRESETS:
         raise RefinerConfigError(f"no refiner size {name!r}; expected one of {', '.join(PRESETS)}")
-    return RefinerConfig(**{**PRESETS[name], **changes})
+    units = LOCAL if changes.get("units") == "local" else {}
+    return RefinerConfig(**{**PRESETS[name], **units, **changes})
 
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -244,3 +256,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 """Values of each size that differ from the defaults of :class:`RefinerConfig`."""
+
+LOCAL: dict[str, Any] = {"units": "local", "norm": "layer", "means_reach": 0.5}
+"""Values that differ from these defaults in networks of any size with local units."""

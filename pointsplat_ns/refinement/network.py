@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pointsplat_ns.refinement.config import RefinerConfig
+from pointsplat_ns.refinement.local_units import APPEARANCE, GEOMETRY, LocalFeatures
 from pointsplat_ns.refinement.sparse_ops import (
     Order,
     by_patches,
@@ -99,7 +100,11 @@ class SceneNorm(nn.Module):
             return F.batch_norm(x, None, None, self.weight, self.bias, True, 0.0, 1e-3)
 
 
-NORMS: dict[str, type[nn.Module]] = {"scene": SceneNorm, "batch": BatchNorm}
+NORMS: dict[str, Callable[[int], nn.Module]] = {
+    "scene": SceneNorm,
+    "batch": BatchNorm,
+    "layer": layer_norm,
+}
 """By the names of ``RefinerConfig.norm``."""
 
 
@@ -116,6 +121,17 @@ class Features:
     features_rest: Tensor  # [N, 3 * num_rest] zero above the scene's degree
     quat_scale: Tensor  # [N, 1] signed length: the scene's quaternion is this times ``quats``
 
+    @property
+    def geometry(self) -> Tensor:
+        """Input of the geometry branch. # [N, 10]"""
+        return torch.cat([self.positions, self.quats, self.scales], dim=1)
+
+    @property
+    def appearance(self) -> Tensor:
+        """Input of the appearance branch, without the SH coefficients of degree 1 and higher.
+        # [N, 4]"""
+        return torch.cat([self.opacities, self.features_dc], dim=1)
+
 
 class DualBranchEncoder(nn.Module):
     """Geometry gated by appearance.
@@ -130,9 +146,11 @@ class DualBranchEncoder(nn.Module):
         super().__init__()
         dim = config.feature_dim
         norm = NORMS[config.norm]
+        local = config.units == "local"
+        geometry, appearance = (GEOMETRY, APPEARANCE) if local else (10, 4)
         self.gate_gain = dim if config.unit_gate else 1
         self.geometry = nn.Sequential(
-            linear(10, dim), norm(dim), nn.ReLU(inplace=True), linear(dim, dim)
+            linear(geometry, dim), norm(dim), nn.ReLU(inplace=True), linear(dim, dim)
         )
         self.position = self.color = self.appearance = None
         if config.use_position:
@@ -147,18 +165,19 @@ class DualBranchEncoder(nn.Module):
                     linear(hidden, reduced),
                 )
             self.appearance = nn.Sequential(
-                linear(4 + reduced, dim), norm(dim), nn.ReLU(inplace=True), linear(dim, dim)
+                linear(appearance + reduced, dim),
+                norm(dim),
+                nn.ReLU(inplace=True),
+                linear(dim, dim),
             )
 
-    def forward(self, features: Features) -> Tensor:
+    def forward(self, features: Features | LocalFeatures) -> Tensor:
         """Encoded Gaussians. # [N, feature_dim]"""
-        geometry = self.geometry(
-            torch.cat([features.positions, features.quats, features.scales], dim=1)
-        )
+        geometry = self.geometry(features.geometry)
         delta = 0.0 if self.position is None else self.position(features.positions)
         if self.appearance is None:
             return geometry + delta
-        parts = [features.opacities, features.features_dc]
+        parts = [features.appearance]
         if self.color is not None:
             parts.append(self.color(features.features_rest))
         gate = torch.softmax(self.appearance(torch.cat(parts, dim=1)) + delta, dim=1)
@@ -381,12 +400,14 @@ class ResidualHeads(nn.Module):
 
     Residuals are in the network's own units: the means' in unit cubes, bounded by tanh to
     ``means_reach``; the quaternions' per unit length; the others as the container stores them.
+    Those in local units are described in :mod:`pointsplat_ns.refinement.local_units`.
     """
 
     def __init__(self, in_channels: int, config: RefinerConfig):
         super().__init__()
         self.means_reach = config.means_reach
-        sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3}
+        turns = 3 if config.units == "local" else 4
+        sizes = {"means": 3, "scales": 3, "quats": turns, "opacities": 1, "features_dc": 3}
         if config.num_rest:
             sizes["features_rest"] = 3 * config.num_rest
 

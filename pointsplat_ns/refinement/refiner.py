@@ -10,6 +10,11 @@ from torch import Tensor, nn
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.transforms import zero_as_identity
 from pointsplat_ns.refinement.config import RefinerConfig
+from pointsplat_ns.refinement.local_units import (
+    LocalUnits,
+    local_features,
+    moved_in_local_units,
+)
 from pointsplat_ns.refinement.network import (
     ConcatEncoder,
     DualBranchEncoder,
@@ -75,12 +80,16 @@ class Refiner(nn.Module):
             return None
         return dataclasses.replace(build_structure(scene[usable], self.config), usable=usable)
 
-    def forward(self, scene: Gaussians, structure: Structure | None = None) -> Gaussians:
+    def forward(
+        self, scene: Gaussians, structure: Structure | None = None, kept: float = 0.1
+    ) -> Gaussians:
         """The refined scene, in the frame, dtype and order of ``scene``.
 
         Args:
             scene: N Gaussians of at most the network's SH degree.
             structure: the result of :meth:`prepare` for these positions; None builds it here.
+            kept: share of the dense scene's Gaussians that the scene holds, in (0, 1]; networks
+                with local units use it.
 
         Raises:
             SceneError: if the scene cannot be refined (see :meth:`prepare`).
@@ -97,11 +106,15 @@ class Refiner(nn.Module):
                 "prepare(scene) again"
             )
         some = scene if structure.usable is None else scene[structure.usable]
-        raw = self.config.raw_inputs
-        features = gaussian_features(some, structure.cube, self.config.num_rest, self.dtype, raw)
-        refined = _moved(
-            some, self.residuals(features, structure), features.quat_scale, structure.cube.extent
-        )
+        if structure.local is not None:
+            refined = self._in_local_units(some, structure, structure.local, kept)
+        else:
+            raw = self.config.raw_inputs
+            features = gaussian_features(
+                some, structure.cube, self.config.num_rest, self.dtype, raw
+            )
+            residuals = self.residuals(features, structure)
+            refined = _moved(some, residuals, features.quat_scale, structure.cube.extent)
         if not self.training and not (sound := refined.usable()).all():
             refined = _put_back(refined[sound], sound, some)
         return refined if structure.usable is None else _put_back(refined, structure.usable, scene)
@@ -119,6 +132,16 @@ class Refiner(nn.Module):
             name: permute(value, structure.inverse, structure.order)
             for name, value in residuals.items()
         }
+
+    def _in_local_units(
+        self, scene: Gaussians, structure: Structure, units: LocalUnits, kept: float
+    ) -> Gaussians:
+        """The refined scene, of usable Gaussians, by a network with local units."""
+        in_memory = scene[structure.order]
+        features = local_features(in_memory, units, self.config.num_rest, kept, self.dtype)
+        encoded = self.encoder(features)
+        residuals = self.heads(torch.cat([self.backbone(encoded, structure), encoded], dim=1))
+        return moved_in_local_units(in_memory, units, residuals)[structure.inverse]
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by name of their learning rate: ``encoder``, ``backbone``, and the attribute

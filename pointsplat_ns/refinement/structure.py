@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pointsplat_ns.geometry.transforms import interleave, spread_bits
 from pointsplat_ns.refinement.config import RefinerConfig
+from pointsplat_ns.refinement.local_units import LocalUnits, local_units
 from pointsplat_ns.refinement.sparse_ops import KernelMap, Order
 from pointsplat_ns.scene.gaussians import Gaussians
 
@@ -144,6 +145,7 @@ class Structure:
     levels: list[GridLevel]
     built_for: tuple  # the settings that it depends on, :func:`structure_key` of its configuration
     usable: Tensor | None = None  # [T] mask of the N Gaussians in the structure; None: all
+    local: LocalUnits | None = None  # neighbours in memory order, for networks with local units
 
     @property
     def total(self) -> int:
@@ -153,7 +155,7 @@ class Structure:
 
 def structure_key(config: RefinerConfig) -> tuple:
     """The settings that a structure depends on."""
-    return (config.grid, tuple(config.strides), tuple(config.curves))
+    return (config.grid, tuple(config.strides), tuple(config.curves), config.units)
 
 
 @torch.no_grad()
@@ -198,7 +200,9 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
             first = first.index_select(0, next_first)
             depths = depths.index_select(0, next_first)
             orders = [_coarser_order(one, cluster) for one, _ in orders]
-    return Structure(cube, order, _invert(order), levels, structure_key(config))
+    # in memory order, which does not depend on the order of the scene
+    local = local_units(scene[order]) if config.units == "local" else None
+    return Structure(cube, order, _invert(order), levels, structure_key(config), local=local)
 
 
 def neighbour_pairs(cells: Tensor) -> KernelMap:

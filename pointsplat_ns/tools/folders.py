@@ -183,7 +183,7 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder) if output is None else Path(output)
-    trained = None if refiner is None else _loaded(refiner)
+    trained = None if refiner is None else _loaded(refiner, by=by)
     options = CompactOptions(
         keep=keep,
         by=by or "",
@@ -360,7 +360,7 @@ class _Compacting:
         kind = format_to_write(task.output)
         options = dataclasses.replace(self.options, target_format=kind.suffix)
         views = ViewProvider(dense, run=task.source, data=options.data, resolution=options.size)
-        trained = None if self.refiner is None else _loaded(self.refiner)
+        trained = None if self.refiner is None else _loaded(self.refiner, by=options.by)
         compact = compact_to_quality if options.searched else compact_scene
         made = compact(dense, options, views, refiner=trained)
         if made.interrupted:

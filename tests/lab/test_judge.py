@@ -10,7 +10,17 @@ import torch
 
 import pointsplat_ns as ps
 from lab.common.programs import Usage, run_measured
-from lab.judge import ablation, camera_paths, cleaning, judge, large, record, refiners, scenes
+from lab.judge import (
+    ablation,
+    camera_paths,
+    cleaning,
+    judge,
+    large,
+    record,
+    refinement,
+    refiners,
+    scenes,
+)
 from lab.judge import bytes as equal_bytes
 from making import box_room, move_zero_layers, run_of
 from peers import peer
@@ -211,6 +221,45 @@ def test_a_refiner_gains_what_it_brings_closer_an_untrained_one_nothing(small, t
     pruned = ps.prune(scene.dense, keep=0.5, by="opacity")
     [(_, _, expected)] = scenes.losses(scene, [pruned], None)
     assert rows[0]["pruned_psnr"] == expected["covered_psnr"]
+
+
+def test_a_refinement_is_measured_beside_the_best_constant(small, tmp_path):
+    """Also, what is measured is not measured again, and the page has a row for each way."""
+    about = {"keep": 0.25, "by": "paper"}
+    save_refiner(Refiner(preset("tiny", units="local")), tmp_path / "net.safetensors", about)
+    found = tmp_path / "rows.json"
+
+    def measure(*asked: str) -> list[dict]:
+        refinement.main(
+            (small,),
+            tuple(f"{name}={tmp_path}/net.safetensors" for name in asked),
+            keep=(0.25,),
+            width=64,
+            views=2,
+            json_path=found,
+        )
+        return rows_of(found)
+
+    rows = measure("untrained")
+    assert [row["way"] for row in rows] == ["selection", "best constant", "merged", "untrained"]
+    assert {row["count"] for row in rows} == {225}
+    selection, constant, _, untrained = (row["psnr"] for row in rows)
+    assert selection == untrained and constant == max(
+        round(scenes_psnr(small, add), 3) for add in refinement.CONSTANTS
+    )
+    assert rows[1]["constant"] in refinement.CONSTANTS
+    again = measure("untrained", "other")
+    assert again[:4] == rows and [row["way"] for row in again[4:]] == ["other"]
+    text = found.with_suffix(".md").read_text()
+    assert "| 25 % | untrained |" in text and "| small | 25 % |" in text
+
+
+def scenes_psnr(path: Path, add: float) -> float:
+    """PSNR of the paper's selection with a constant added to its log-scales."""
+    scene = scenes.load(path, (64,), 2)
+    pruned = ps.prune(scene.dense, keep=0.25, by="paper")
+    dense = scenes.DenseViews(scene.dense, scene.looks[0].views)
+    return dense.psnr(pruned.replace(scales=pruned.scales + add))
 
 
 def test_each_strength_is_measured_in_held_out_photos(trained_walls, capsys):

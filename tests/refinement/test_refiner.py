@@ -17,15 +17,18 @@ def scene_to_refine(
 
 
 ENCODERS = pytest.mark.parametrize("encoder", ["dual", "concat"])
+UNITS = pytest.mark.parametrize("units", ["scene", "local"])
 
 
-@ENCODERS
+@pytest.mark.parametrize(
+    "changes", [{"encoder": "dual"}, {"encoder": "concat"}, {"units": "local"}]
+)
 @pytest.mark.parametrize("duplicates", [False, True])
-def test_permuting_the_gaussians_permutes_the_result(duplicates, encoder):
+def test_permuting_the_gaussians_permutes_the_result(duplicates, changes):
     scene = scene_to_refine(300)
     if duplicates:  # shared cells, coincident means with other parameters
         scene = scene.replace(means=scene.means[torch.arange(300) % 100])
-    refiner = small_refiner(encoder=encoder)
+    refiner = small_refiner(**changes)
     mix = torch.randperm(300, generator=torch.Generator().manual_seed(5))
     assert same(refiner(scene[mix]), refiner(scene)[mix])
 
@@ -110,8 +113,12 @@ def test_a_scene_of_lower_degree_is_refined_as_if_padded_with_zeros(sh_degree):
         {"use_position": False},
         {"use_appearance": False, "use_position": False},
         {"stem": "linear", "raw_inputs": True},
+        {"units": "local"},
     ],
-    ids=["dual", "concat", "no appearance", "no position", "geometry only", "linear stem"],
+    ids=[
+        *("dual", "concat", "no appearance", "no position", "geometry only", "linear stem"),
+        "local units",
+    ],
 )
 def test_gradients_reach_every_parameter_once_the_zero_layers_have_moved(changes):
     scene = scene_to_refine(400)
@@ -126,9 +133,10 @@ def test_gradients_reach_every_parameter_once_the_zero_layers_have_moved(changes
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
 
 
-def test_a_float64_network_equals_the_float32_one_within_rounding():
+@UNITS
+def test_a_float64_network_equals_the_float32_one_within_rounding(units):
     scene = scene_to_refine(dtype=torch.float64)
-    refiner = small_refiner()
+    refiner = small_refiner(units=units)
     single = refiner(scene)
     double = refiner.double()(scene)
     for (key, a), b in zip(single.items(), double.tensors(), strict=True):
@@ -170,10 +178,11 @@ def hard_scenes() -> dict[str, Gaussians]:
     }
 
 
+@UNITS
 @pytest.mark.parametrize("name", hard_scenes())
-def test_an_untrained_refiner_returns_hard_scenes_to_the_bit(name):
+def test_an_untrained_refiner_returns_hard_scenes_to_the_bit(name, units):
     scene = hard_scenes()[name]
-    refined = small_refiner(trained=False)(scene)
+    refined = small_refiner(trained=False, units=units)(scene)
     zero = (scene.quats == 0).all(dim=1)
     identity = torch.tensor([1.0, 0, 0, 0])
     assert same(refined, scene.replace(quats=torch.where(zero[:, None], identity, scene.quats)))
@@ -186,6 +195,8 @@ def test_an_untrained_refiner_returns_hard_scenes_to_the_bit(name):
         ({"norm": "batch"}, True),
         ({"grid": 384}, True),
         ({"encoder": "concat"}, False),
+        ({"units": "local"}, False),
+        ({"units": "local"}, True),
     ],
 )
 @pytest.mark.parametrize("name", hard_scenes())
@@ -208,11 +219,12 @@ def test_output_and_gradients_of_hard_scenes_are_finite(name, training, changes)
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "features_dc", "features_rest"])
-def test_unusable_gaussians_come_back_unchanged_and_change_no_others(name, bad):
+@UNITS
+def test_unusable_gaussians_come_back_unchanged_and_change_no_others(units, name, bad):
     scene = scene_to_refine(60)
     bad_rows = torch.tensor([0, 17, 59])
     getattr(scene, name)[bad_rows] = bad
-    refiner = small_refiner()
+    refiner = small_refiner(units=units)
     refined = refiner(scene)
     good = scene.usable()
     # -Inf is a legal log-scale: such a Gaussian is flat, and refined

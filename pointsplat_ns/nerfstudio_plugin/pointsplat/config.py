@@ -15,6 +15,7 @@ from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import take_network_of
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
@@ -63,6 +64,10 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     """Largest norm of all gradients together, in place of each optimiser's max-norm for its own
     part."""
 
+    init: str | None = None
+    """Start from the weights of a trained refiner, and take the options of its network: shipped,
+    which has one for merging and one for selections, a .safetensors file, or a run."""
+
     steps_per_eval_batch: Suppress[Fixed[int]] = 0  # nerfstudio's, without effect here
 
     def check(self) -> None:
@@ -85,6 +90,9 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
 
     def set_timestamp(self) -> None:
         """See the base class; processes that ``torchrun`` started are connected here."""
+        if self.init is not None:
+            assert isinstance(self.pipeline, PointSplatPipelineConfig)
+            take_network_of(self.init, self.pipeline.model)
         super().set_timestamp()
         connect_torchrun("nccl" if self.machine.device_type == "cuda" else "gloo")
 

@@ -16,7 +16,14 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import (
+    PIECES,
+    ScenePiece,
+    count_of,
+    cut_scenes,
+)
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
+from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.scene.discovery import Supervision, find_runs_and_plys, shown_scene
 from pointsplat_ns.scene.runs import open_run
 
@@ -41,6 +48,17 @@ class ScenesDataManagerConfig(DataManagerConfig):
     out in addition."""
     sampled_size: tuple[int, int] = (320, 240)
     """Width and height, in pixels, of renders from sampled poses."""
+    pieces: int | None = None
+    """Cut larger training scenes by planes into pieces of at most so many Gaussians, and train on
+    these: many small scenes teach more than few large ones. A piece has its own renders, so this
+    needs dense supervision, where it is 12000 by default. 0 trains on whole scenes."""
+    cuts: int = 1
+    """Number of different cuts of each scene into pieces; each further cut makes pieces of two
+    thirds of the size."""
+    piece_poses: int = 12
+    """Number of poses sampled for each piece."""
+    pieces_folder: Path | None = None
+    """Keep the poses and renders of pieces there, for later trainings on the same pieces."""
     eval_scenes: tuple[str, ...] = ()
     """Names of scenes never to train on, to evaluate the refiner on unseen scenes."""
     images_per_step: int = 2
@@ -88,6 +106,9 @@ class ScenesDataManager(DataManager):
                 "x 1"
             )
         self._pixels = 0
+        self._usable: dict[int, bool] = {}
+        self.prune_settings: tuple[PruneSettings, ...] = ()
+        """How the model prunes scenes: pieces of which too little is left are not trained on."""
         self.cache = MemoryCache.of(config.cache_gigabytes)
         self.supervision, self.scenes = self._found_scenes(Path(config.data))
         names = [scene.name for scene in self.scenes]
@@ -108,7 +129,15 @@ class ScenesDataManager(DataManager):
             )
         self.shown = names.index(shown_scene(names, config.eval_scenes))
         """The scene that the viewer and the exporter get."""
-        training = ", ".join(names[i] for i in self.train_indices)
+        self.training_names = [names[i] for i in self.train_indices]
+        training = ", ".join(self.training_names)
+        self.whole_scenes = len(self.scenes)
+        """Number of scenes; pieces of them follow these in ``scenes``."""
+        pieces = config.pieces
+        if pieces is None:
+            pieces = PIECES if self.supervision == "dense" else 0
+        if pieces and test_mode == "val":
+            training = self._cut(pieces)
         held_out = (
             ", ".join(config.eval_scenes)
             or "no scene (held-out photos of the training scenes serve)"
@@ -174,6 +203,37 @@ class ScenesDataManager(DataManager):
             )
         return chosen, scenes
 
+    def _cut(self, most: int) -> str:
+        """Train on pieces of at most ``most`` Gaussians of the training scenes that have more; what
+        is trained on, for the log. Raises DataError if pieces cannot be trained on, SceneError if
+        nothing can."""
+        config = self.config
+        if self.supervision != "dense":
+            raise DataError(
+                f"--pipeline.datamanager.pieces {most}: photos show whole scenes; expected "
+                "--pipeline.datamanager.supervision dense"
+            )
+        if min(most, config.cuts, config.piece_poses) < 1:
+            raise DataError(
+                f"{config.cuts} cuts into pieces of {most} Gaussians with {config.piece_poses} "
+                "poses: expected at least 1 of each"
+            )
+        large: list[int] = []
+        small: list[int] = []
+        for index in self.train_indices:
+            count = count_of(self.scenes[index])
+            if count is not None:
+                (large if count > most else small).append(index)
+        pieces = cut_scenes([self.scenes[i] for i in large], most, config)
+        self.train_indices = small + list(range(len(self.scenes), len(self.scenes) + len(pieces)))
+        if not self.train_indices:
+            raise SceneError(f"{config.data}: none of its scenes can be trained on")
+        self.training_names = [self.scenes[i].name for i in sorted(large + small)]
+        whole = [self.scenes[i].name for i in small]
+        cut = [f"{len(pieces)} pieces of {', '.join(self.scenes[i].name for i in large)}"]
+        self.scenes += pieces
+        return ", ".join(whole + (cut if pieces else []))
+
     @property
     def train_dataset(self) -> InputDataset | None:  # type: ignore[override]
         """Training photos of the shown scene, for the viewer."""
@@ -203,12 +263,29 @@ class ScenesDataManager(DataManager):
         return step * self.world_size + self.local_rank
 
     def scene_at(self, step: int) -> int:
-        """Index of the scene of a step. Each scene comes once before any is repeated."""
+        """Index of the scene of a step. Each scene comes once before any is repeated. A piece that
+        cannot be trained on is logged, and another takes its place."""
         epoch, place = divmod(self.place(step), len(self.train_indices))
         order = random.Random(f"{self.config.seed} scenes {epoch}").sample(
             self.train_indices, len(self.train_indices)
         )
-        return order[place]
+        for index in order[place:] + order[:place]:
+            if self._can_train_on(index):
+                return index
+        raise SceneError(f"{self.config.data}: no piece of its scenes can be trained on")
+
+    def _can_train_on(self, index: int) -> bool:
+        """Whether a scene, by its index, is whole, or a piece that can be seen and of which
+        something is kept. Pieces that are not are logged once."""
+        piece = self.scenes[index]
+        if not isinstance(piece, ScenePiece):
+            return True
+        if index not in self._usable:
+            why = piece.why_not(self.prune_settings)
+            if why:
+                log(f"{piece.name} is left out: {why}")
+            self._usable[index] = not why
+        return self._usable[index]
 
     def next_train(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
         """Index of a training scene, and some of its training photos with their cameras, on this

@@ -16,6 +16,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
+from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.rendering import render
 from pointsplat_ns.rendering.comparison.sizes import RESOLUTION, subsampled
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -69,6 +70,12 @@ class DenseScene:
         """Renders of the dense scene, in 8 bits as photos are from training poses, not rounded from
         held-out ones."""
 
+    @property
+    def sampled_poses(self) -> int:
+        """Number of training poses to sample."""
+        assert self._poses is not None
+        return self._poses.sampled_poses
+
     @cached_property
     def identity(self) -> str:
         """Text by which a checkpoint records that the network was trained on this scene: the name,
@@ -102,6 +109,19 @@ class DenseScene:
                 self.cache.put(key, dense)
         return dense
 
+    def pruned(
+        self, settings: PruneSettings, dense: Gaussians | None = None
+    ) -> tuple[Gaussians, float]:
+        """The pruned scene, and the share of Gaussians that it holds. ``dense`` are the scene's
+        Gaussians, if they have been read."""
+        dense = self.dense(keep=False) if dense is None else dense
+        smaller = settings.prune(dense)
+        return smaller, len(smaller) / max(1, len(dense))
+
+    def training_background(self) -> Tensor:
+        """Background colour (3,) of a training step, in [0, 1]."""
+        return self.background
+
     def cameras(self, split: Split) -> Cameras:
         """Pinhole cameras (C,) sampled, different ones for each split: a fifth as many are held
         out. Every second one of the training split is subsampled from a picture of the size that
@@ -109,7 +129,7 @@ class DenseScene:
         visible."""
         assert self._poses is not None
         size = self._poses.sampled_size
-        count = self._poses.sampled_poses
+        count = self.sampled_poses
         seed = random.Random(f"{self._poses.seed} poses {split}").getrandbits(31)
         try:
             views = sample_views(

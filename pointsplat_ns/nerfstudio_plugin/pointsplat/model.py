@@ -24,7 +24,12 @@ from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
-from pointsplat_ns.pipeline.trained_refiner import network_options
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import ScenePiece
+from pointsplat_ns.pipeline.trained_refiner import (
+    NETWORK_OPTIONS,
+    load_refiner,
+    network_options,
+)
 from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.refinement import Refiner, Structure, preset
 from pointsplat_ns.refinement.augmentation import random_transform
@@ -65,10 +70,13 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     only."""
     use_position: bool = True
     """Add the positional term delta to both branches (the paper's Table 4); dual encoder only."""
-    norm: Literal["scene", "batch"] = "scene"
+    units: Literal["scene", "local"] = "scene"
+    """Unit of positions, sizes and their residuals: the scene's extent, as published, or the
+    distance of each Gaussian to its neighbours, so that a piece and a whole scene mean the same."""
+    norm: Literal["scene", "batch", "layer"] | None = None
     """Normalisation outside the attention blocks. scene: statistics of the current scene, also in
     evaluation. batch: the published one, with running averages over the training scenes in
-    evaluation."""
+    evaluation. layer: of each Gaussian by itself. By default layer with local units, else scene."""
     enc_depths: tuple[int, ...] | None = None
     """Blocks in each stage of the backbone's encoder; by default those of size."""
     stem: Literal["conv", "linear"] = "conv"
@@ -77,9 +85,9 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     raw_inputs: bool = False
     """Give the network log-scales and opacity logits as they are, not brought to order 1. With the
     encoder concat this is the imbalance of features that the paper speaks of."""
-    means_reach: float = 0.05
+    means_reach: float | None = None
     """Largest move of a mean along an axis, as a share of the scene's extent (the authors' code:
-    1)."""
+    1), or in local units; by default 0.05, or 0.5 in local units."""
     train_encoder: bool = True
     """Train the encoder. The authors' code leaves it at its random weights."""
     pixel_loss: PixelLoss = "l1"
@@ -91,6 +99,9 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Network of LPIPS in the training loss. auto is vgg on CUDA, and elsewhere alex, which is
     thirty times cheaper."""
 
+    init: str | None = None
+    """Weights to start from; set by --init, which takes the options of that network, too."""
+
     sh_degree: ClassVar[int] = 3
     """Read by ``ns-export``: above 0, colours are SH coefficients. A scene may have any degree."""
 
@@ -100,12 +111,29 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
         return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
 
 
+def take_network_of(init: str, config: PointSplatModelConfig) -> None:
+    """Start from a trained refiner (``shipped``, a file or a run): set the config to the options of
+    its network. Raises WeightsError or SceneError if there is no such refiner, and SceneError if no
+    options give its network."""
+    trained = load_refiner(init, "cpu", config.by)
+    for name in ("size", *NETWORK_OPTIONS):
+        if name in trained.options:
+            setattr(config, name, trained.options[name])
+    if preset(config.size, **network_options(vars(config))) != trained.network.config:
+        raise SceneError(
+            f"--init {init}: no options of ns-train give its network; expected one that ns-train "
+            "pointsplat trained"
+        )
+    config.init = init
+
+
 class PrunedScene(NamedTuple):
-    """A pruned scene, on the device of the network, and its neighbour tables, None if it is
-    empty."""
+    """A pruned scene, on the device of the network, its neighbour tables, None if it is empty, and
+    the share of the dense scene's Gaussians that was kept."""
 
     pruned: Gaussians
     structure: Structure | None
+    kept: float
 
 
 class PointSplatModel(SplatfactoModel):
@@ -123,10 +151,16 @@ class PointSplatModel(SplatfactoModel):
                 f"--pipeline.model.lpips-weight {config.lpips_weight:g}: expected a finite "
                 "number, 0 or above"
             )
+        manager: ScenesDataManager = self.kwargs["datamanager"]
         self.refiner = Refiner(preset(config.size, **network_options(vars(config))))
+        if config.init is not None and manager.test_mode == "val":
+            trained = load_refiner(config.init, "cpu", config.by)
+            self.refiner.load_state_dict(trained.network.state_dict())
         self.refiner.encoder.requires_grad_(config.train_encoder)
         self.crop_box: OrientedBox | None = None
-        manager: ScenesDataManager = self.kwargs["datamanager"]
+        manager.prune_settings = tuple(
+            config.prune_settings(keep) for keep in (config.keep, *config.more_keeps)
+        )
         self.scenes = manager.scenes
         self.shown = manager.shown
         self._cache = manager.cache
@@ -174,14 +208,16 @@ class PointSplatModel(SplatfactoModel):
         key = "pruned", scene.name, settings
         found = self._cache.get(key)
         if found is None:
-            dense = scene.dense(keep=False) if dense is None else dense
             try:
-                smaller = settings.prune(dense)
+                smaller, kept = scene.pruned(settings, dense)
             except PointSplatError as error:
                 raise type(error)(f"{scene.source}: {error}") from error
-            log(f"{scene.name}: kept {len(smaller):,} of {len(dense):,} Gaussians")
+            if not isinstance(scene, ScenePiece):
+                log(f"{scene.name}: kept {len(smaller):,} Gaussians, {kept:.1%}")
             smaller = smaller.to(self.device)
-            found = PrunedScene(smaller, self.refiner.prepare(smaller))
+            # An augmented piece gets tables of its own at each step.
+            piece = self.config.augment and isinstance(scene, ScenePiece)
+            found = PrunedScene(smaller, None if piece else self.refiner.prepare(smaller), kept)
             self._cache.put(key, found)
         return found
 
@@ -194,19 +230,25 @@ class PointSplatModel(SplatfactoModel):
             drawn = int(torch.randint(len(keeps), (), device="cpu")) if len(keeps) > 1 else 0
             scene = self.pruned_scene(index, keep=keeps[drawn])
             if not self.config.augment:
-                return self.refiner(scene.pruned, scene.structure)
+                return self.refiner(*scene)
             transform = random_transform()
-            return transform.undo(self.refiner(transform.apply(scene.pruned)))
+            return transform.undo(self.refiner(transform.apply(scene.pruned), kept=scene.kept))
         if self._refined is None or self._refined[0] != index:
             scene = self.pruned_scene(index)
             with torch.no_grad():
-                self._refined = index, self.refiner(scene.pruned, scene.structure)
+                self._refined = index, self.refiner(*scene)
         return self._refined[1]
 
-    def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
+    def draw(
+        self,
+        gaussians: Gaussians,
+        scene: DenseScene,
+        camera: Cameras,
+        background: Tensor | None = None,
+    ) -> dict[str, Tensor]:
         """Render Gaussians as a scene is drawn, from a camera of shape (1,): ``rgb`` (H, W, 3) in
         [0, 1], ``accumulation`` (H, W, 1), ``background`` (H, W, 3), and in evaluation ``depth``
-        (H, W, 1) in scene units."""
+        (H, W, 1) in scene units. The ``background`` (3,) is by default the scene's."""
         width = int(camera.width.item())
         height = int(camera.height.item())
         image, alpha, _ = self.config.rasterize(
@@ -225,7 +267,7 @@ class PointSplatModel(SplatfactoModel):
             render_mode="RGB" if self.training else "RGB+ED",
             rasterize_mode="antialiased" if gaussians.antialiased else scene.rasterize_mode,
         )
-        background = scene.background.to(image)
+        background = (scene.background if background is None else background).to(image)
         outputs = {
             "rgb": (image[0, ..., :3] + (1 - alpha[0]) * background).clamp(0, 1),
             "accumulation": alpha[0],
@@ -258,7 +300,7 @@ class PointSplatModel(SplatfactoModel):
         outputs: dict[str, Tensor] = {}
         pairs = []
         for camera, data in frames:
-            outputs = self.draw(refined, scene, camera)
+            outputs = self.draw(refined, scene, camera, scene.training_background())
             mask = data.get("mask", 1)
             pairs.append((outputs["rgb"] * mask, self.photo_of(data, outputs["background"]) * mask))
         pixel_loss = torch.stack(

@@ -34,11 +34,19 @@ from pointsplat_ns.system import processes
 
 MODEL_METADATA = (
     "size",
+    "encoder",
+    "use_appearance",
+    "use_position",
+    "enc_depths",
+    "stem",
+    "raw_inputs",
     "by",
     "keep",
     "more_keeps",
     "opacity_weight",
+    "units",
     "norm",
+    "means_reach",
     "train_encoder",
     "pixel_loss",
     "lpips_weight",
@@ -169,14 +177,14 @@ class PointSplatPipeline(VanillaPipeline):
         model = self.model
         lpips = ReportedLpips()
         reports: list[evaluation.SceneReport] = []
-        for index in range(processes.rank(), len(manager.scenes), self.world_size):
+        for index in range(processes.rank(), manager.whole_scenes, self.world_size):
             scene = manager.scenes[index]
             dense = scene.dense(keep=False)
-            pruned, structure = model.pruned_scene(index, dense)
+            found = model.pruned_scene(index, dense)
             variants = {
                 "dense": dense.to(model.device),
-                "pruned": pruned,
-                "refined": model.refiner(pruned, structure),
+                "pruned": found.pruned,
+                "refined": model.refiner(*found),
             }
             report = evaluate_scene(
                 model, scene, variants, scene.frames("test"), lpips, output_path, progress=True
@@ -209,7 +217,7 @@ class PointSplatPipeline(VanillaPipeline):
             trainer = attributes.trainer
             of_trainer = ("method_name", "rate_factor", "schedule", "drop_at", "global_norm")
             if trainer is not None and processes.rank() == 0:
-                names = [self.datamanager.scenes[i].name for i in self.datamanager.train_indices]
+                names = self.datamanager.training_names
                 save_refiner(
                     self.model.refiner,
                     trainer.base_dir / RUN_FILES.refiner,
