@@ -86,8 +86,9 @@ def test_no_command_sends_what_a_name_orders(words, scene, printed):
 @pytest.mark.parametrize(
     "words", ["info {scene}", "prune {scene} --by opacity --keep 50% --poses none"]
 )
-def test_a_result_shows_the_whole_name(words, scene, printed):
-    text = printed(lambda: main([word.format(scene=scene) for word in words.split()]))
+def test_a_result_shows_the_whole_name(words, scene, capsys):
+    main([word.format(scene=scene) for word in words.split()])
+    text = "".join(capsys.readouterr())
     need_shown(text.replace(".ply", "").replace("_pruned", ""))
 
 
