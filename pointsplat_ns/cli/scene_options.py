@@ -175,7 +175,7 @@ def quantities() -> ConstructorRegistry:
     path = PrimitiveConstructorSpec(
         nargs=1,
         metavar="PATH",
-        instance_from_str=lambda words: _path(words[0]),
+        instance_from_str=lambda words: options.parse_path(words[0]),
         is_instance=lambda value: isinstance(value, Path),
         str_from_instance=lambda value: [str(value)],
     )
@@ -214,12 +214,6 @@ def quantities() -> ConstructorRegistry:
         return own[0] if own else rules.get(kinds[0])  # of an optional number as of the number
 
     return registry
-
-
-def _path(text: str) -> Path:
-    if not text:
-        raise ValueError("an empty path; expected a name, or . for the current folder")
-    return Path(text)
 
 
 def _float(text: str) -> float:

@@ -54,6 +54,14 @@ def _as_written(metavar: str) -> PrimitiveConstructorSpec:
     )
 
 
+def parse_path(text: str) -> Path:
+    """The path that was written. Raises ValueError if it is empty, which would be the current
+    folder: that of a script whose variable is not set."""
+    if not text:
+        raise ValueError("an empty path; expected a name, or . for the current folder")
+    return Path(text)
+
+
 def _photos(words: list[str]) -> Path | bool:
     if len(words) > 1 or words == [""]:
         raise ValueError("expected a folder of photos, or nothing for those of a run")
@@ -63,7 +71,16 @@ def _photos(words: list[str]) -> Path | bool:
 Budget = Annotated[Any, _as_written("BUDGET")]
 """A ratio, count, size or PSNR, as text or parsed (:data:`~pointsplat_ns.pruning.Keep`)."""
 
-Poses = Annotated[Path | str | None, _as_written("PATH")]
+Poses = Annotated[
+    Path | str | None,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda words: parse_path(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, (Path, str)),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
 """A file of cameras, a run, or :data:`NO_POSES`."""
 
 Resolution = Annotated[tuple[int, int] | str | None, _as_written("WxH")]

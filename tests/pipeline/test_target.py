@@ -25,7 +25,7 @@ def dense() -> ps.Gaussians:
 
 
 @pytest.fixture(scope="module")
-def views(dense) -> ps.Views:
+def views(dense, quick) -> ps.Views:
     return sample_views(dense, 3, 48, 36)
 
 

@@ -166,7 +166,7 @@ import resource, sys
 import torch
 from pointsplat_ns.cli import main
 import pointsplat_ns.cli.info, pointsplat_ns.cli.convert, pointsplat_ns.scene.reading, psutil
-import pointsplat_ns.tools.scene_info, pointsplat_ns.pipeline.requests, PIL.Image, scipy.spatial
+import pointsplat_ns.tools.scene_info, pointsplat_ns.pipeline.run, PIL.Image, scipy.spatial
 size = psutil.Process().memory_info().vms
 resource.setrlimit(resource.RLIMIT_AS, (size + 300_000_000, -1))
 main(sys.argv[1:])

@@ -106,6 +106,7 @@ def measure_tradeoff(
     check_options(keep, by, repairs, within, views)
     path = Path(scene)
     folder = Path(folder)
+    need_folder(folder)
     for name in RESULTS.values():
         need_new(folder / name, force)
     with progress_bar(progress) as report:
@@ -113,7 +114,6 @@ def measure_tradeoff(
         own = None if photos is None else Path(photos)
         options = ViewOptions(poses=poses, resolution=resolution, up=up, data=data)
         subject = subject_at(path, options, own, report, "photos" in repairs)
-        need_folder(folder)
         table = settings_of(subject.dense, keep, by, repairs)
         measuring = _Measuring(Measurer(subject, views), within, folder)
         try:

@@ -11,7 +11,7 @@ from lab.tables import layout
 from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
 from making import box_room
-from pointsplat_ns.pipeline import repair, view_provider
+from pointsplat_ns.pipeline import repair_budget, view_provider
 from pointsplat_ns.refinement import Refiner, preset
 from pointsplat_ns.refinement.weights import save_refiner
 from quick import quick_settings
@@ -50,7 +50,7 @@ def room(tmp_path, views_of_room, no_lpips, monkeypatch) -> Path:
     monkeypatch.setattr(
         layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure")
     )
-    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    monkeypatch.setitem(repair_budget.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"
 

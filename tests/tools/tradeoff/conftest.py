@@ -7,7 +7,7 @@ import pytest
 
 import pointsplat_ns as ps
 from making import box_room
-from pointsplat_ns.pipeline import repair, view_provider
+from pointsplat_ns.pipeline import repair_budget, view_provider
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.tools.tradeoff.points import Tradeoff
 from pointsplat_ns.view_sampling.sampler import sample_views
@@ -33,7 +33,7 @@ def room_views(room) -> Views:
 def measured(room, room_views, tmp_path, monkeypatch) -> Callable[..., Tradeoff]:
     """A function that measures the room in these views, by default merged to a tenth, to the folder
     ``out``. Repairs take two steps."""
-    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    monkeypatch.setitem(repair_budget.STEPS, "quick", 2)
     monkeypatch.setattr(
         view_provider.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count]
     )

@@ -16,8 +16,7 @@ import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.pipeline import compact_scene as compact
-from pointsplat_ns.pipeline import repair, view_provider
+from pointsplat_ns.pipeline import repair_budget, stages, view_provider
 from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.pipeline.repair import Repaired
 from pointsplat_ns.pipeline.view_provider import ViewProvider
@@ -106,7 +105,7 @@ def test_an_interruption_keeps_what_was_measured(measured, tmp_path, monkeypatch
 
 def test_ctrl_c_during_a_repair_is_no_shorter_repair(measured, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        compact, "repair", lambda scene, *_, **others: Repaired(scene, 1, 0.1, interrupted=True)
+        stages, "repair", lambda scene, *_, **others: Repaired(scene, 1, 0.1, interrupted=True)
     )
     with pytest.raises(KeyboardInterrupt):
         measured(repairs=["quick"])
@@ -192,7 +191,7 @@ SETTINGS = [Setting(40), Setting(40, "quick", "paper"), Setting(40, by="coverage
 def test_a_command_makes_the_scene_that_was_measured(
     setting, room, room_views, tmp_path, monkeypatch
 ):
-    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    monkeypatch.setitem(repair_budget.STEPS, "quick", 2)
     monkeypatch.setattr(view_provider.Sampler, "views", lambda *args, **options: room_views)
     monkeypatch.chdir(tmp_path)
     path = Path("the room.ply")
