@@ -126,10 +126,10 @@ def test_a_gallery_shows_each_scene_before_and_after_or_why_not(
     )
     compact_scene = folders.compact_scene
 
-    def interrupted(dense, *given):
+    def interrupted(dense, *given, **named):
         if (tmp_path / "small" / "deep" / "c.spz").exists():
             raise KeyboardInterrupt
-        return compact_scene(dense, *given)
+        return compact_scene(dense, *given, **named)
 
     monkeypatch.setattr(folders, "compact_scene", interrupted)
     with pytest.raises(SystemExit) as end:
