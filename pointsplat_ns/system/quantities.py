@@ -1,5 +1,4 @@
-"""Counts, sizes and durations as people write them: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB, 5 min 14
-s."""
+"""Counts, sizes and durations as text: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB, 5 min 14 s."""
 
 from __future__ import annotations
 
@@ -9,8 +8,8 @@ from decimal import Decimal
 
 
 def parse_number(text: str) -> float:
-    """A number, with k, M or G for thousands, millions or billions. Raises ValueError if it is
-    none.
+    """A number, with k, M or G for thousands, millions or billions. Raises ValueError for any other
+    text.
 
     Example:
         >>> parse_number("1e3"), parse_number("1.5M"), parse_number("1,000"), parse_number("0.3")
@@ -20,7 +19,7 @@ def parse_number(text: str) -> float:
     found = re.fullmatch(form, text.strip(), re.IGNORECASE)
     if found is None or not re.match(r"[+-]?[\d.]*\d", found[1]):
         raise ValueError(
-            f"{text!r} is no number; expected one such as 0.5, 1000, 1,000, 1e3, 10k or 1.5M"
+            f"{text!r} is not a number; expected one such as 0.5, 1000, 1,000, 1e3, 10k or 1.5M"
         )
     number = float(
         Decimal(found[1].replace(",", ""))
@@ -32,7 +31,7 @@ def parse_number(text: str) -> float:
 
 
 def parse_count(text: str) -> int:
-    """A whole number, as :func:`parse_number` reads it. Raises ValueError if it is none.
+    """A whole number, as :func:`parse_number` reads it. Raises ValueError for any other text.
 
     Example:
         >>> parse_count("10k"), parse_count("1.5M")
@@ -41,14 +40,13 @@ def parse_count(text: str) -> int:
     number = parse_number(text)
     if number != int(number):
         raise ValueError(
-            f"{text!r} is no whole number; expected one such as 1000, 1,000, 1e3 or 10k"
+            f"{text!r} is not a whole number; expected one such as 1000, 1,000, 1e3 or 10k"
         )
     return int(number)
 
 
 def parse_megabytes(text: str) -> float:
-    """A size, in units of 10^6 bytes; a number without a unit is in MB. Raises ValueError if it is
-    none.
+    """A size in MB (10^6 bytes), also the default unit. Raises ValueError for any other text.
 
     Example:
         >>> parse_megabytes("12kb"), parse_megabytes("1GB"), parse_megabytes("12"), parse_megabytes("5000B")
@@ -59,7 +57,7 @@ def parse_megabytes(text: str) -> float:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things.
+    """A count with its noun.
 
     Example:
         >>> counted(1, "size"), counted(2000, "point")
@@ -69,7 +67,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def seconds_text(seconds: float) -> str:
-    """A duration with the digits that matter.
+    """A duration with its significant digits.
 
     Example:
         >>> seconds_text(3.14), seconds_text(31.4), seconds_text(314), seconds_text(3140), seconds_text(7000)
