@@ -70,7 +70,8 @@ class Views:
         >>> import torch
         >>> import pointsplat_ns as ps
         >>> K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
-        >>> views = ps.Views(torch.eye(4).repeat(3, 1, 1), K.repeat(3, 1, 1), 64, 48, torch.zeros(3))
+        >>> poses = torch.eye(4).repeat(3, 1, 1)
+        >>> views = ps.Views(poses, K.repeat(3, 1, 1), 64, 48, torch.zeros(3))
         >>> len(views), len(views[1:]), views[0].width
         (3, 2, 64)
     """

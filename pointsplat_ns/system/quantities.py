@@ -49,8 +49,8 @@ def parse_megabytes(text: str) -> float:
     """A size in MB (10^6 bytes), also the default unit. Raises ValueError for any other text.
 
     Example:
-        >>> parse_megabytes("12kb"), parse_megabytes("1GB"), parse_megabytes("12"), parse_megabytes("5000B")
-        (0.012, 1000.0, 12.0, 0.005)
+        >>> [parse_megabytes(text) for text in ("12kb", "1GB", "12", "5000B")]
+        [0.012, 1000.0, 12.0, 0.005]
     """
     text = text.strip()
     return parse_number(text[:-1]) / 1e6 if text.lower().endswith("b") else parse_number(text)
@@ -70,8 +70,8 @@ def seconds_text(seconds: float) -> str:
     """A duration with its significant digits.
 
     Example:
-        >>> seconds_text(3.14), seconds_text(31.4), seconds_text(314), seconds_text(3140), seconds_text(7000)
-        ('3.1 s', '31 s', '5 min 14 s', '52 min', '1 h 57 min')
+        >>> [seconds_text(seconds) for seconds in (3.14, 31.4, 314, 3140, 7000)]
+        ['3.1 s', '31 s', '5 min 14 s', '52 min', '1 h 57 min']
     """
     if seconds < 100:
         return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
