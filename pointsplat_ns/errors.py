@@ -65,7 +65,7 @@ class DataError(PointSplatError):
         ...     ps.sample_views(ps.example_room()[:0], 12)
         ... except ps.DataError as error:
         ...     print(error)
-        nothing of the scene can be seen, so there is no place to look from
+        nothing of the scene is visible, so no view can be sampled
     """
 
 

@@ -71,7 +71,7 @@ def merge(
 
     Args:
         scene: N Gaussians. Those that cannot be drawn
-            (:meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable`) are dropped, unless ``k`` is N.
+            (:meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable`) are dropped unless ``k`` is N.
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
         views: views in which the result should look the same, such as the poses of the scene's
