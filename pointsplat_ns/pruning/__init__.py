@@ -1,4 +1,4 @@
-"""Making a scene smaller: pruning methods, budgets, SH bands."""
+"""Makes scenes smaller: pruning methods, budgets, SH bands."""
 
 from pointsplat_ns.pruning.budget import (
     Keep,

@@ -1,4 +1,4 @@
-"""A differentiable rasterizer of 3D Gaussians in pure torch, shaped like gsplat's."""
+"""A differentiable rasterizer of 3D Gaussians in plain torch, with gsplat's interface."""
 
 from pointsplat_ns.rendering.rasterization import rasterization
 from pointsplat_ns.rendering.render_scene import (

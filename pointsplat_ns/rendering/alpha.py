@@ -1,15 +1,15 @@
-"""The rule of alpha and transmittance: which Gaussian is drawn on which pixel, and how strongly.
+"""Alpha and transmittance: which Gaussian is drawn on which pixel, and with which weight.
 
 Alpha is ``min(ALPHA_MAX, opacity * exp(-sigma))``, where sigma is half the squared Mahalanobis
-distance of the pixel. A Gaussian is not drawn on a pixel where its alpha is lower than a threshold.
-From front to back, each Gaussian drawn multiplies the transmittance by ``1 - alpha``; a pixel is
+distance of the pixel. A Gaussian is not drawn on a pixel if its alpha is below a threshold. From
+front to back, each drawn Gaussian multiplies the transmittance by ``1 - alpha``; a pixel is
 finished before the Gaussian that would bring it to a second threshold or less. (3DGS, section 6;
-the thresholds stand in :mod:`~pointsplat_ns.rendering.constants`.)
+the thresholds are in :mod:`~pointsplat_ns.rendering.constants`.)
 
-The compiled kernels (``blending.cpp``) and ``lab/numerics/reference.py``, which checks both, write
-it out once more.
+The compiled kernels (``blending.cpp``) and ``lab/numerics/reference.py``, which checks both,
+implement the same rule.
 
-Shapes: B tiles, S Gaussians of a chunk from front to back, 64 pixels of a tile.
+Shapes: B tiles, S Gaussians of a chunk from front to back, 64 pixels per tile.
 """
 
 from __future__ import annotations
@@ -21,21 +21,20 @@ from torch import Tensor
 from pointsplat_ns.rendering.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 
 CLAMPED = ALPHA_MAX * (1 - 1e-6)
-"""Alphas of at least this count as clamped; the margin covers the rounding of ALPHA_MAX to
-float32."""
+"""Alphas from here on count as clamped; the margin covers the rounding of ALPHA_MAX to float32."""
 
 STEP_BY_STEP = 64
-"""Largest chunk that is scanned one Gaussian at a time; longer chunks take fewer, larger
+"""Largest chunk that is scanned one Gaussian at a time; longer chunks use fewer, larger
 operations."""
 
 
 def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Tensor:
-    """Alphas, zero where a Gaussian is not drawn, in place of their unclamped logarithms to base 2.
+    """Alphas, 0 if a Gaussian is not drawn, in place of their unclamped logarithms to base 2.
 
     Args:
         log2_alpha: any shape, overwritten.
         alpha_min: alphas up to this are not drawn.
-        may_clamp: False saves a pass where no opacity exceeds ALPHA_MAX.
+        may_clamp: False saves a pass if no opacity exceeds ALPHA_MAX.
     """
     alpha = log2_alpha.exp2_()
     if may_clamp:
@@ -44,19 +43,19 @@ def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Ten
 
 
 def is_clamped(alpha: Tensor) -> Tensor:
-    """Mask of alpha that is clamped to ALPHA_MAX, where it has no gradient."""
+    """Mask of alphas clamped to ALPHA_MAX, which have no gradient."""
     return alpha >= CLAMPED
 
 
 def is_drawn(after: Tensor, out: Tensor | None = None) -> Tensor:
     """Mask of the pixels that a Gaussian does not finish, from the transmittance behind it; as 0
-    and 1 in ``out`` if that is given."""
+    and 1 in ``out`` if given."""
     return torch.gt(after, TRANSMITTANCE_MIN, out=out)
 
 
 def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
-    """Transmittance in front of each Gaussian of a chunk and behind the last, as if no pixel were
-    ever finished.
+    """Transmittance in front of each Gaussian of a chunk and behind the last, ignoring that pixels
+    are finished.
 
     Args:
         passing: (B, S, 64), 1 - alpha.
@@ -64,15 +63,14 @@ def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
         out: (B, S + 1, 64), written and returned.
     """
     out[:, 0] = before
-    size = 16  # Gaussians of a group
+    size = 16  # Gaussians per group
     if passing.shape[1] <= STEP_BY_STEP or passing.shape[1] % size:
         steps = out.unbind(1)
         for k, factor in enumerate(passing.unbind(1)):
             torch.mul(steps[k], factor, out=steps[k + 1])
         return out
-    groups = out[:, 1:].unflatten(
-        1, (-1, size)
-    )  # products of each group at once, then group by group
+    # products of all groups at a time, then group by group
+    groups = out[:, 1:].unflatten(1, (-1, size))
     steps = groups.unbind(2)
     factors = passing.unflatten(1, (-1, size)).unbind(2)
     steps[0].copy_(factors[0])
@@ -85,7 +83,7 @@ def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:
 
 
 def last_transmittance(through: Tensor, drawn: Tensor) -> Tensor:
-    """The transmittance (B, 64) behind the last Gaussian drawn.
+    """Transmittance (B, 64) behind the last drawn Gaussian.
 
     Args:
         through: (B, S + 1, 64) of :func:`transmittances`.

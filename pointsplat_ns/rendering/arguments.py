@@ -1,5 +1,7 @@
-"""Checks the arguments of :func:`~pointsplat_ns.rendering.rasterization.rasterization`, not the values
-of tensors."""
+"""Checks arguments of :func:`~pointsplat_ns.rendering.rasterization.rasterization`.
+
+Values of tensors are not checked.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,8 @@ def check_tensors(
     backgrounds: Tensor | None,
     **tensors: Tensor,
 ) -> None:
-    """Raise a ValueError that names the argument if a shape does not fit. Values are left alone:
-    looking at them would have to wait for the device."""
+    """Raise a ValueError that names the argument if a shape does not match. Values are not checked,
+    because reading them would synchronise with the device."""
     n, c = (tensors[name].shape[0] if tensors[name].dim() else 0 for name in ("means", "viewmats"))
     wanted = {
         "means": (n, 3),
@@ -31,7 +33,7 @@ def check_tensors(
         if tuple(tensors[name].shape) != expected:
             raise ValueError(f"{name} has shape {tuple(tensors[name].shape)}; expected {expected}")
     if c == 0:
-        raise ValueError("viewmats holds no camera; expected at least one")
+        raise ValueError("viewmats has no camera; expected at least one")
     shape = (
         tuple(colors.shape) if isinstance(colors, Tensor) else _shape_together(colors, n, sh_degree)
     )
@@ -45,7 +47,7 @@ def check_tensors(
 def _shape_together(
     colors: tuple[Tensor, Tensor], n: int, sh_degree: int | None
 ) -> tuple[int, ...]:
-    """The shape that the first SH coefficients and the others would have in one tensor."""
+    """Shape of one tensor with the first SH coefficients and the others."""
     shapes = [tuple(tensor.shape) for tensor in colors]
     if sh_degree is None:
         raise ValueError(
@@ -60,7 +62,7 @@ def _shape_together(
 
 
 def _check_channels(shape: tuple[int, ...], n: int, harmonics: bool) -> int:
-    """The number of channels of colours, or of SH coefficients, which is 3."""
+    """Number of channels of colours, or 3 for SH coefficients."""
     if harmonics and (len(shape) != 3 or shape[::2] != (n, 3)):
         raise ValueError(f"colors has shape {shape}; expected SH coefficients ({n}, K, 3)")
     if not harmonics and (shape[:-1] != (n,) or shape[-1] < 1):
@@ -72,7 +74,7 @@ def _check_channels(shape: tuple[int, ...], n: int, harmonics: bool) -> int:
 def check_options(
     width: int, height: int, near_plane: float, far_plane: float, **others: Any
 ) -> None:
-    """Raise a ValueError that names the argument if a number or name has no meaning."""
+    """Raise a ValueError that names the argument if a number or name is invalid."""
     if not (
         hasattr(width, "__index__") and hasattr(height, "__index__") and width >= 1 and height >= 1
     ):

@@ -1,7 +1,7 @@
 """Front-to-back alpha blending over tiles, with its own backward pass.
 
-Done in torch (:mod:`~pointsplat_ns.rendering.blocks`), or by compiled kernels where they were
-built (:mod:`~pointsplat_ns.rendering.compiled.blending_kernels`), by the algebra of
+Runs in torch (:mod:`~pointsplat_ns.rendering.blocks`), or with compiled kernels if they were built
+(:mod:`~pointsplat_ns.rendering.compiled.blending_kernels`), by the algebra of
 :mod:`~pointsplat_ns.rendering.quadratics` and the rule of :mod:`~pointsplat_ns.rendering.alpha`.
 
 Shapes: M Gaussians, 64 = TILE * TILE pixels, D channels.
@@ -23,7 +23,7 @@ from pointsplat_ns.system.tensors import full_precision
 
 
 def untiled(values: Tensor, columns: int) -> Tensor:
-    """Pixels (H, W, D) of tiles (rows * columns, [D,] 64)."""
+    """Pixels (H, W, D) from tiles (rows * columns, [D,] 64)."""
     rows = len(values) // columns
     return (
         values.view(rows, columns, -1, TILE, TILE)
@@ -33,7 +33,7 @@ def untiled(values: Tensor, columns: int) -> Tensor:
 
 
 def tiled(values: Tensor, rows: int, columns: int) -> Tensor:
-    """Tiles (rows * columns, D, 64) of pixels (H, W, D), zeros beyond them."""
+    """Tiles (rows * columns, D, 64) from pixels (H, W, D), padded with zeros."""
     height, width, channels = values.shape
     whole = values.new_zeros(rows * TILE, columns * TILE, channels)
     whole[:height, :width] = values
@@ -45,11 +45,11 @@ def tiled(values: Tensor, rows: int, columns: int) -> Tensor:
 
 
 class Blend(torch.autograd.Function):
-    """Blend projected Gaussians into some rows of tiles; see :func:`blend`."""
+    """Blend projected Gaussians into rows of tiles; see :func:`blend`."""
 
     @staticmethod
     def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, rows, keep_lists, absgrad):
-        """The lists are kept for the backward pass only if ``keep_lists``."""
+        """Lists are stored for the backward pass only if ``keep_lists``."""
         engine = compiled_blending if footprints.compiled else blocks
         grid = footprints.grid
         tiles = footprints.tiles(*rows)
@@ -101,17 +101,17 @@ def blend(
     Args:
         seen: M projected Gaussians.
         colors: (M, D), D at most 4 for kernels.
-        footprints: of the same Gaussians, by kernels if these are to blend.
-        memory_budget: an image whose lists of pairs would take more bytes is drawn in several
-            bands, one after the other, and their lists are computed again for the backward pass.
+        footprints: of the same Gaussians; made by kernels to blend with kernels.
+        memory_budget: bytes of the lists of pairs; a larger image is drawn in several bands, one
+            after the other, and the backward pass recomputes their lists.
         absgrad: (K, 2), to which the backward pass adds the sums over pixels of the absolute
-            gradients of means2d, and their rows in it, (M,) int64.
+            gradients of means2d; and (M,) int64, the rows of the Gaussians in it.
 
     Returns:
         Colours (H, W, D) over black, and the remaining transmittance (H, W, 1).
     """
     size = colors.element_size()
-    # 192 bytes a pair of RGB in float32: lists, tape, gradient sums, of which each channel has one
+    # 192 bytes a pair of RGB in float32: lists, tape and gradient sums, which have all channels
     bands = footprints.regions(max(1, memory_budget // (48 * size + (colors.shape[1] - 3) * size)))
     shapes = seen.means2d, seen.cov2d, seen.det, seen.opacities
     drawn = [

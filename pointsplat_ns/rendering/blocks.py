@@ -1,6 +1,6 @@
-"""Blending in plain torch: tiles of similar length together, in blocks that fit the cache.
+"""Blending in plain torch: tiles with lists of similar length, in blocks that fit the cache.
 
-Sixteen Gaussians at a time, more where few tiles are left; tiles whose pixels are all saturated are
+Chunks have sixteen Gaussians, more if few tiles are left; tiles whose pixels are all saturated are
 dropped.
 
 Shapes: P pairs, B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D channels.
@@ -50,7 +50,7 @@ class Inputs(NamedTuple):
 def inputs_of(
     means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, alpha_min: float
 ) -> Inputs:
-    """Projected Gaussians (M, ...) and their colours (M, D) as blending reads them."""
+    """Blending inputs from projected Gaussians (M, ...) and their colours (M, D)."""
     table = table_of(means2d, cov2d, det, opacities, colors)
     return Inputs(
         table, colors.shape[1], bool((opacities > ALPHA_MAX).any()), alpha_min, basis_of(means2d)
@@ -58,7 +58,7 @@ def inputs_of(
 
 
 class WorkArrays:
-    """The work arrays of a block, allocated once: for so many pairs, and so many tiles."""
+    """Work arrays of a block, allocated once for a number of pairs and of tiles."""
 
     def __init__(self, pairs: int, tiles: int, like: Tensor):
         self._arrays = [like.new_empty(pairs * PIXELS) for _ in range(3)]
@@ -74,8 +74,7 @@ class WorkArrays:
 
 
 def _sums_behind(terms: Tensor, behind: Tensor, out: Tensor) -> Tensor:
-    """``behind`` (B, 64) plus the sum of the terms from each Gaussian on, (B, S + 1, 64), from
-    terms (B, S, 64)."""
+    """Suffix sums (B, S + 1, 64) of the terms (B, S, 64), plus ``behind`` (B, 64)."""
     out[:, -1] = behind
     if terms.shape[1] > STEP_BY_STEP:
         torch.add(terms.flip(1).cumsum(1).flip(1), behind[:, None], out=out[:, :-1])
@@ -89,12 +88,12 @@ def _sums_behind(terms: Tensor, behind: Tensor, out: Tensor) -> Tensor:
 def _pass_chunk(
     inputs: Inputs, pairs: Quadratics, before: Tensor, work: WorkArrays
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Alpha and transmittance of a chunk, for both passes, in the work arrays 0, 1 and that of the
+    """Alpha and transmittance of a chunk, for both passes, in work arrays 0 and 1 and the array of
     transmittances.
 
     Returns:
-        Alphas and 1 - alpha (B, S, 64), and transmittances as if no pixel were ever finished (B, S
-        + 1, 64).
+        Alphas and 1 - alpha (B, S, 64), and transmittances that ignore that pixels are finished
+        (B, S + 1, 64).
     """
     b, s = pairs.rows.shape[:2]
     alpha = work.array(0, b, s)
@@ -115,13 +114,13 @@ def blend_chunk(
     """Blend S Gaussians into each tile of ``blended`` (B, D, 64), in place.
 
     Returns:
-        Transmittance after them, 0 where the pixel is finished, and the last one that was not, (B,
-        64) each.
+        Transmittance after them, 0 if the pixel is finished, and the last one above the threshold,
+        (B, 64) each.
     """
     alpha, passing, through = _pass_chunk(inputs, pairs, before, work)
     weight = alpha.mul_(through[:, :-1])
     after = through[:, -1].clone()
-    if bool((~is_drawn(after) & (before > 0)).any()):  # a pixel is finished by this chunk
+    if bool((~is_drawn(after) & (before > 0)).any()):  # this chunk finishes a pixel
         drawn = is_drawn(through[:, 1:], out=passing)
         weight.mul_(drawn)
         finished = last_transmittance(through, drawn)
@@ -148,8 +147,8 @@ def blend_chunk_backward(
         pixels: (B, D, 64) gradient of the image.
 
     Returns:
-        Gradients of log alpha (B, S, 64) and of the colours (B, D, S), and ``behind`` for the chunk
-        before.
+        Gradients of log alpha (B, S, 64) and of the colours (B, D, S), and ``behind`` for the
+        previous chunk.
     """
     b, s = pairs.rows.shape[:2]
     alpha, passing, through = _pass_chunk(inputs, pairs, before, work)
@@ -161,9 +160,8 @@ def blend_chunk_backward(
     at_clamp = is_clamped(alpha) if inputs.may_clamp else None
     grad_colors = torch.bmm(pixels, weight.transpose(1, 2))
     weight.mul_(torch.bmm(pairs.colors, pixels, out=alpha))  # weight * (color . grad)
-    sums_behind = _sums_behind(
-        weight, behind, out=through
-    )  # the transmittances are no longer needed
+    # the transmittances are no longer needed
+    sums_behind = _sums_behind(weight, behind, out=through)
     grad_log = weight.addcmul_(odds, sums_behind[:, 1:], value=-1.0)
     if at_clamp is not None:
         grad_log.masked_fill_(at_clamp, 0.0)
@@ -171,9 +169,9 @@ def blend_chunk_backward(
 
 
 class Tiles(NamedTuple):
-    """Some tiles, each (B,)."""
+    """A selection of tiles, each field (B,)."""
 
-    ids: Tensor  # int64, which tile of the region
+    ids: Tensor  # int64, index in the region
     x: Tensor  # centre, pixels
     y: Tensor
     start: Tensor  # int64, first pair
@@ -184,23 +182,23 @@ class Tiles(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Tensors of one chunk of one block that the backward pass needs."""
+    """Tensors of one chunk of one block for the backward pass."""
 
     tiles: Tiles
-    rows: Tensor | None  # [B] which tiles of the block are left; None while all are
-    first: int  # place in each tile's list
+    rows: Tensor | None  # [B] tiles of the block that are left; None if all are
+    first: int  # position in each tile's list
     size: int  # S
-    before: Tensor  # [B, 64] transmittance before the chunk; 0 where the pixel is finished
+    before: Tensor  # [B, 64] transmittance before the chunk; 0 if the pixel is finished
 
 
 class Frame:
     """The tiles of one region, longest list first, and their pairs."""
 
     STEP = 16
-    """Gaussians blended at once for each tile, before the saturated tiles are dropped; chunks are
-    multiples of it."""
+    """Number of Gaussians blended per tile before saturated tiles are dropped; chunks are multiples
+    of it."""
     LONGEST = 1024
-    """Largest number of Gaussians in a chunk."""
+    """Maximum number of Gaussians in a chunk."""
 
     def __init__(self, grid: Grid, tiles: TileList, dtype: torch.dtype):
         lengths = tiles.offsets[1:] - tiles.offsets[:-1]
@@ -215,30 +213,28 @@ class Frame:
         )
         self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
-        self.gaussians = F.pad(
-            tiles.gaussians, (0, 1), value=tiles.order.numel()
-        )  # the last pair is padding
-        # Pairs in a work array: on a CPU 2 MB in float32. The size does not depend on the number of
-        # threads, because sums are rounded by how lists are cut.
+        # the last pair is padding
+        self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())
+        # Pairs per work array: on a CPU 2 MB in float32. The size is independent of the number of
+        # threads, because the rounding of sums depends on where lists are cut.
         pairs = 2**18 if lengths.is_cuda else 2**13
         self.block = max(1, min(pairs // self.STEP, self.occupied))  # tiles
         self.capacity = pairs
 
     def chunk_size(self, tiles: int, longest: int) -> int:
-        """Gaussians to blend at once: more where few tiles are left, no more than their lists
-        hold."""
+        """Chunk size: larger if few tiles are left, no larger than their lists."""
         size = min(self.capacity // max(tiles, 1), longest + self.STEP - 1, self.LONGEST)
         return max(size // self.STEP, 1) * self.STEP
 
     def inside(self, tiles: Tiles) -> Tensor:
-        """1 for the pixels of tiles (B,) that are in the image, (B, 64)."""
+        """1 for the pixels of tiles (B,) inside the image, (B, 64)."""
         axis = torch.arange(TILE, device=tiles.x.device, dtype=torch.int64) - (TILE // 2)
         columns = tiles.x[:, None] + axis < self.grid.width
         rows = tiles.y[:, None] + axis < self.grid.height
         return (rows[:, :, None] & columns[:, None, :]).view(-1, PIXELS).to(tiles.x.dtype)
 
     def pairs(self, tiles: Tiles, first: int, size: int) -> Tensor:
-        """Places in the pair list of S Gaussians for each tile, (B * S,); one past all pairs where
+        """Positions in the pair list of S Gaussians for each tile, (B * S,); one past all pairs if
         a list has ended."""
         place = tiles.start[:, None] + torch.arange(
             first, first + size, device=tiles.start.device, dtype=torch.int64
@@ -247,7 +243,7 @@ class Frame:
 
 
 Tape = tuple[Frame, list[list[Chunk]]]
-"""Results of the forward pass that the backward pass needs: the chunks by block."""
+"""Results of the forward pass for the backward pass: the chunks of each block."""
 
 
 def _blend_block(
@@ -304,8 +300,8 @@ def _blend_block(
 def blend_region(
     grid: Grid, tiles: TileList, inputs: Inputs, image: Tensor, final: Tensor, keep_tape: bool
 ) -> Tape | None:
-    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape
-    if it is wanted."""
+    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); returns
+    the tape if requested."""
     frame = Frame(grid, tiles, image.dtype)
     if frame.occupied < frame.tiles:
         image.zero_()
@@ -330,9 +326,8 @@ def differentiate_region(
     MOMENTS + D [+ 2])."""
     frame, blocks = tape
     total = sum(chunk.before.shape[0] * chunk.size for chunks in blocks for chunk in chunks)
-    sums = grad_image.new_empty(
-        total + 1, MOMENTS + inputs.channels + (2 if absgrad else 0)
-    )  # in the tape's order
+    # in tape order
+    sums = grad_image.new_empty(total + 1, MOMENTS + inputs.channels + (2 if absgrad else 0))
     sums[-1] = 0.0
     place = frame.gaussians.new_empty(total)  # in the pair list
     work = WorkArrays(frame.capacity, frame.block, grad_image)
@@ -374,7 +369,7 @@ def differentiate_region(
                     packed[:, MOMENTS + channels + column] = slope.mul_(flat).abs_().sum(-1)
             moments(pairs, torch.mm(inputs.basis, flat.T), packed)
 
-    # group the sums of pairs by Gaussian; pairs behind a saturated tile have no sum
+    # sum pairs by Gaussian; pairs behind a saturated tile have no sum
     by_place = place.new_full((frame.pairs_count + 1,), total)
     by_place.index_copy_(0, place, torch.arange(total, device=place.device, dtype=torch.int64))
     by_gaussian = torch.empty_like(tiles.places).index_copy_(0, tiles.places, by_place[:-1])

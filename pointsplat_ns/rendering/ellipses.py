@@ -1,4 +1,4 @@
-"""The 1/255 ellipses of projected Gaussians, and the tiles that each touches, in torch.
+"""The 1/255 ellipses of projected Gaussians, and the tiles that they touch, in torch.
 
 Shapes: M Gaussians, P pairs of Gaussian and tile.
 """
@@ -14,11 +14,11 @@ from pointsplat_ns.rendering.constants import SLACK, TILE
 
 
 class Grid(NamedTuple):
-    """The tiles of the image that the ellipses are in."""
+    """Tile grid of the image."""
 
     width: int  # pixels
     height: int
-    alpha_min: float  # a Gaussian is not drawn where its alpha is lower
+    alpha_min: float  # a Gaussian with a lower alpha is not drawn
 
     @property
     def rows(self) -> int:
@@ -30,36 +30,33 @@ class Grid(NamedTuple):
 
 
 class Ellipses(NamedTuple):
-    """The ellipses within which Gaussians have an alpha of at least ``alpha_min``, from which their
-    tiles follow."""
+    """Ellipses within which Gaussians have an alpha of at least ``alpha_min``."""
 
     order: Tensor  # [M] int64, rows of the projected Gaussians in depth order
     # [M, 7] x, y, level, 1 / yy, peak, slope, variance, pixels, in depth order; or the kernels'
     # table
     shapes: Tensor
-    boxes: (
-        Tensor  # [M, 4] in the order of shapes, first and last row of tiles, first and last column
-    )
+    # [M, 4] in the order of shapes: first and last row of tiles, first and last column
+    boxes: Tensor
 
 
 class TileList(NamedTuple):
-    """For each tile of some rows of tiles the Gaussians that touch it, front to back; P pairs in
-    all."""
+    """Gaussians that touch each tile of some rows of tiles, front to back; P pairs in all."""
 
     gaussians: Tensor  # [P] int64, rows of the projected Gaussians, grouped by tile
-    offsets: Tensor  # [tiles + 1] int64, where each tile's group starts
-    # [P] int64, where each pair stands when pairs are grouped by Gaussian (in depth order) instead
+    offsets: Tensor  # [tiles + 1] int64, start of each tile's group
+    # [P] int64, position of each pair if grouped by Gaussian (in depth order) instead
     places: Tensor
     counts: Tensor  # [M] int64, pairs of each Gaussian, in depth order
     order: Tensor  # [M] int64, the Gaussians in depth order
-    top: int  # the first row of tiles
+    top: int  # first row of tiles
 
 
 def by_depth(depths: Tensor) -> Tensor:
-    """Rows in ascending order of depth, equal depths in the order of the input."""
+    """Rows in ascending order of depth; equal depths keep the input order."""
     bits = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
-    # integers, which are radix-sorted, with the order of the floats; bits of negative floats are in
-    # reverse order
+    # integers, which are radix-sorted, in the order of the floats; the bits of negative floats are
+    # in reverse order
     bits = torch.where(bits < 0, bits ^ torch.iinfo(bits.dtype).max, bits)
     return torch.sort(bits, stable=True).indices
 
@@ -72,7 +69,7 @@ def ellipses_of(
     order: Tensor,  # [M] int64, rows in depth order
     grid: Grid,
 ) -> Ellipses:
-    """The ellipses of projected Gaussians."""
+    """Ellipses of projected Gaussians."""
     xx, xy, yy = cov2d.unbind(-1)
     level = 2.0 * (opacities / grid.alpha_min).log().clamp_min_(0.0)
     # Over a strip of y, the right edge mx + r dy + sqrt(v (level - dy^2 / yy)) is concave in dy,
@@ -95,8 +92,8 @@ def ellipses_of(
 
 
 def pairs_of(ellipses: Ellipses, grid: Grid, top: int, bottom: int) -> TileList:
-    """Pair Gaussians with the tiles of the rows from ``top`` on before ``bottom``, and sort the
-    pairs by tile, then depth, then row of the input."""
+    """Pair Gaussians with the tiles of the rows from ``top`` up to, but not including, ``bottom``;
+    sorted by tile, then depth, then input row."""
     owner, row, column0, column1 = _strips(ellipses, grid, top, bottom)
     widths = (column1 - column0 + 1).clamp_min_(0)
     counts = torch.zeros_like(ellipses.order).index_add_(0, owner, widths)
@@ -106,7 +103,7 @@ def pairs_of(ellipses: Ellipses, grid: Grid, top: int, bottom: int) -> TileList:
     gaussian = ellipses.order.index_select(0, owner).index_select(0, strip)
 
     tiles = (bottom - top) * grid.columns
-    if tiles < 2**31:  # the fewer the bits, the fewer the passes of a radix sort
+    if tiles < 2**31:  # fewer bits, fewer passes of the radix sort
         tile = tile.to(torch.int16 if tiles < 2**15 else torch.int32)
     tile, places = torch.sort(tile, stable=True)
     edges = torch.arange(
@@ -119,8 +116,7 @@ def pairs_of(ellipses: Ellipses, grid: Grid, top: int, bottom: int) -> TileList:
 def _strips(
     ellipses: Ellipses, grid: Grid, top_row: int, bottom_row: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Each row of tiles that each Gaussian reaches: the Gaussian (depth order), the row, first and
-    last column."""
+    """Strips of tiles that Gaussians touch: Gaussian (depth order), row, first and last column."""
     row0 = ellipses.boxes[:, 0].clamp_min(top_row)
     row1 = ellipses.boxes[:, 1].clamp_max(bottom_row - 1)
     owner, row = _expand((row1 - row0 + 1).clamp_min_(0))
@@ -142,8 +138,7 @@ def _strips(
 
 
 def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For ``counts`` (M,): the owner of each of ``sum(counts)`` items and its place with that
-    owner."""
+    """For ``counts`` (M,): the owner of each of ``sum(counts)`` items, and its position there."""
     owner = torch.repeat_interleave(counts)
     starts = torch.cumsum(counts, 0) - counts
     place = torch.arange(owner.numel(), device=counts.device, dtype=torch.int64)
@@ -151,8 +146,8 @@ def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _tile_of(position: Tensor, up: bool, tiles: int) -> Tensor:
-    """First tile with a pixel centre at or after ``position`` (up), or last with one at or
-    before."""
+    """First tile with a pixel centre at or after ``position`` (up), or last one with a pixel centre
+    at or before it."""
     if up:
         tile = torch.ceil((position - (TILE - 0.5)) / TILE)
         return tile.clamp_(0, tiles).long()

@@ -1,15 +1,17 @@
-"""EWA splatting with its hand-derived gradient: :func:`projection.project` in torch.
+"""EWA splatting with a hand-derived gradient: :func:`projection.project` in torch.
 
-Everything is held component by component, (components, M), so that each operation runs over
-contiguous memory. With ``W`` the camera's rotation, ``R`` that of the Gaussian, ``S`` its scales
-and ``J`` the Jacobian of the projection, the rows of ``J W`` are
+Tensors are stored by component, (components, M), so that operations run over contiguous memory.
+With ``W`` the camera's rotation, ``R`` that of the Gaussian, ``S`` its scales and ``J`` the
+Jacobian of the projection, the rows of ``J W`` are
 
     fx / z * a,  a = W[0] - tx W[2]        fy / z * b,  b = W[1] - ty W[2]
 
 and ``P = J W R S`` (2 x 3) has the rows ``p1 = fx / z * (R^T a) * s`` and ``p2 = fy / z * (R^T b) *
-s``. The covariance is ``P P^T + eps2d I``. Its determinant is summed from squares, ``det = |p1 x
-p2|^2 + eps2d (|p1|^2 +
-|p2|^2) + eps2d^2``, so that a needle does not lose it to cancellation as ``xx yy - xy^2`` does in float32.
+s``. The covariance is ``P P^T + eps2d I``. Its determinant is a sum of squares,
+
+    det = |p1 x p2|^2 + eps2d (|p1|^2 + |p2|^2) + eps2d^2
+
+which for a needle avoids the cancellation of ``xx yy - xy^2`` in float32.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from pointsplat_ns.system.tensors import full_precision
 
 
 class Lens(NamedTuple):
-    """Intrinsics of a camera and limits of what it draws."""
+    """Intrinsics of a camera and drawing limits."""
 
     fx: float  # pixels
     fy: float
@@ -34,15 +36,15 @@ class Lens(NamedTuple):
     cy: float
     width: int
     height: int
-    near: float  # depths, scene units
+    near: float  # depth, scene units
     far: float
     radius_clip: float  # pixels
     eps2d: float  # pixels^2
     antialiased: bool
 
     def clamps(self) -> list[tuple[float, float]]:
-        """Bounds of x / z and y / z where the Jacobian is evaluated: they follow the principal
-        point (gsplat #305)."""
+        """Bounds of x / z and y / z for the Jacobian, relative to the principal point (gsplat
+        #305)."""
         bounds = []
         for side, focal, middle in (
             (self.width, self.fx, self.cx),
@@ -54,28 +56,28 @@ class Lens(NamedTuple):
         return bounds
 
     def steepness(self) -> float:
-        """Bound of ``|J| z``, pixels: of the focal length times the length of (1, 1, clamp)."""
+        """Bound of ``|J| z``, pixels: the focal length times the length of (1, 1, clamp)."""
         return max(abs(self.fx), abs(self.fy)) * (
             1.0 + sum(abs(bound) for ends in self.clamps() for bound in ends)
         )
 
 
 def longest_axis(dtype: torch.dtype) -> float:
-    """Largest standard deviation in the image, pixels, 1e9 in float32: the determinant of a longer
-    one would overflow, and both are flat over any image."""
+    """Largest standard deviation in the image, pixels, 1e9 in float32: beyond it the determinant
+    would overflow, and Gaussians are flat over any image anyway."""
     return torch.finfo(dtype).max ** 0.25 / 4
 
 
 def longest_reach(dtype: torch.dtype, lens: Lens) -> float:
-    """Largest standard deviation divided by depth: longer axes are drawn with this one, and have no
-    gradient. No more than 1e-9 of an image would depend on them in float32."""
+    """Largest standard deviation divided by depth: longer axes are clamped to it, and have no
+    gradient. In float32, this changes at most 1e-9 of an image."""
     return longest_axis(dtype) / lens.steepness()
 
 
 def _rotation_backward(
     quats: Tensor, a: Tensor, grad_a: Tensor, b: Tensor, grad_b: Tensor
 ) -> Tensor:
-    """Gradient (4, M) by the unit quaternion, for ``R`` with the gradient ``a grad_a^T + b
+    """Gradient (4, M) of the unit quaternion, for ``R`` with the gradient ``a grad_a^T + b
     grad_b^T``."""
     w, x, y, z = quats
 
@@ -107,7 +109,7 @@ def _rotation_backward(
 
 
 def _cross(p: Tensor, q: Tensor) -> list[Tensor]:
-    """Cross product of rows (3, M). Each component is of two columns of P, so a needle's is
+    """Cross product of rows (3, M). Each component uses two columns of P, so a needle's is
     exact."""
     return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
 
@@ -119,8 +121,7 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def _candidates(points: Tensor, scales: Tensor, opacities: Tensor, lens: Lens) -> Tensor:
-    """Rows of Gaussians that may touch the image, by a bound on their extent that needs no
-    covariance."""
+    """Rows of Gaussians that may touch the image, by a bound of their extent without covariance."""
     x, y, z = points
     max_std = torch.maximum(torch.maximum(scales[:, 0], scales[:, 1]), scales[:, 2])  # NaN stays
     seen = (z > lens.near) & (z < lens.far) & (opacities >= ALPHA_MIN) & (max_std < torch.inf)
@@ -162,13 +163,13 @@ def _shape(
 
 
 class Project(torch.autograd.Function):
-    """Project what one camera sees; see :func:`projection.project`. The camera's rotation and
-    centre, and the gradients by them, are on the CPU in float64, whatever the device of the
+    """Project the Gaussians that one camera sees; see :func:`projection.project`. The camera's
+    rotation and centre, and their gradients, are on the CPU in float64, whatever the device of the
     Gaussians."""
 
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, view, centre, lens: Lens):
-        # the centre in two parts: at 1e6 from the origin float32 alone would move the camera by
+        # the centre in two parts: at 1e6 from the origin, float32 alone would move the camera by
         # 0.03 units
         near_centre = centre.to(means.dtype)
         remainder = (centre - near_centre).to(means.dtype)
@@ -180,8 +181,8 @@ class Project(torch.autograd.Function):
         points = torch.addmm(offset, view, (means - near_centre).T)  # (3, N)
         ids = _candidates(points, scales, opacities, lens)
 
-        # The candidates, in float64: far from the camera, x and y are small sums of large products,
-        # and depths differ by little.
+        # Candidates in float64: far from the camera, x and y are small sums of large products, and
+        # depths differ little.
         directions = means.index_select(0, ids).double() - centre
         exact = wide @ directions.T
         points = exact.to(means.dtype)
@@ -211,9 +212,8 @@ class Project(torch.autograd.Function):
         mx = slopes[0] * lens.fx + lens.cx
         my = slopes[1] * lens.fy + lens.cy
         radii = 3.0 * (0.5 * (xx + yy) + (0.25 * (xx - yy) ** 2 + xy * xy).sqrt()).sqrt()
-        level = (
-            2.0 * (alphas / ALPHA_MIN).log()
-        )  # squared Mahalanobis distance of the 1/255 ellipse
+        # squared Mahalanobis distance of the 1/255 ellipse
+        level = 2.0 * (alphas / ALPHA_MIN).log()
         half_x = (level * xx).clamp_min(0).sqrt()
         half_y = (level * yy).clamp_min(0).sqrt()
         keep = (
@@ -285,8 +285,7 @@ class Project(torch.autograd.Function):
             det0 = cross[0].square() + cross[1].square() + cross[2].square()
             blur = lens.eps2d * ((p1 * p1).sum(0) + (p2 * p2).sum(0) + lens.eps2d)
             det = det0 + blur
-            # 1 - det0 / det as blur / det: the difference has no digit left where the Gaussian is
-            # large
+            # 1 - det0 / det as blur / det, because the difference cancels if the Gaussian is large
             grad_det0 = grad_det + grad_ratio / det * (blur / det)
             grad_det = grad_det - grad_ratio * ratio / det
         normal = torch.stack(cross) * (2 * grad_det0)
@@ -299,9 +298,8 @@ class Project(torch.autograd.Function):
         grad_jx = grad_p1 * (lens.fx * rz)
         grad_jy = grad_p2 * (lens.fy * rz)
         grad_std = (shape.turned_a * grad_jx).addcmul_(shape.turned_b, grad_jy)
-        grad_std *= std * rz < longest_reach(std.dtype, lens) * (
-            1 - 1e-6
-        )  # the longest axes are as long for any scale
+        # clamped axes do not depend on the scale
+        grad_std *= std * rz < longest_reach(std.dtype, lens) * (1 - 1e-6)
         grad_log_rz = (std * grad_std).sum(0)
         grad_turned_a = grad_jx.mul_(std)
         grad_turned_b = grad_jy.mul_(std)
@@ -310,8 +308,7 @@ class Project(torch.autograd.Function):
         grad_a = _times(transposed, grad_turned_a)
         grad_b = _times(transposed, grad_turned_b)
 
-        # x / z and y / z: once as the image position, once, where it is not clamped, in the
-        # Jacobian
+        # x / z and y / z: in the image position and, unless clamped, in the Jacobian
         (low_x, high_x), (low_y, high_y) = lens.clamps()
         gx, gy = grad_means2d.T
         grad_u = lens.fx * gx - (view[2] @ grad_a) * ((slopes[0] >= low_x) & (slopes[0] <= high_x))

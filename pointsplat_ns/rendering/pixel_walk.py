@@ -1,11 +1,11 @@
-"""Sums over the pixels of a view, for each Gaussian, that no gradient of the picture gives.
+"""Sums over the pixels of a view, for each Gaussian, that are not gradients of the image.
 
-Such as how many pixels a Gaussian is drawn on, or the sum of squares of the gradients of each
-pixel. The projected Gaussians of a view are walked front to back, tile by tile, by the rasterizer's
-rules.
+For example the number of pixels on which a Gaussian is drawn, or the sum of squared per-pixel
+gradients. The projected Gaussians of a view are processed front to back, tile by tile, by the
+rasterizer's rules.
 
-Shapes: M Gaussians seen, B tiles of a block, L Gaussians in the longest list of the block, 64
-pixels a tile.
+Shapes: M visible Gaussians, B tiles of a block, L Gaussians in the longest list of the block, 64
+pixels per tile.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class PixelBlock(NamedTuple):
     ids: Tensor  # [B, L] rows of the projected Gaussians
     alpha: Tensor  # [B, L, 64]
     before: Tensor  # [B, L, 64] transmittance in front of the Gaussian
-    final: Tensor  # [B, 64] transmittance behind all that are drawn
+    final: Tensor  # [B, 64] transmittance behind all drawn Gaussians
     gx: Tensor  # [B, L, 64] d log alpha / d mean x, 1 / pixels
     gy: Tensor  # [B, L, 64]
-    clamped: Tensor  # [B, L, 64] where alpha is held at its maximum
+    clamped: Tensor  # [B, L, 64] where alpha is clamped to its maximum
 
 
 def sum_over_pixels(
@@ -50,8 +50,8 @@ def sum_over_pixels(
     Args:
         seen: M Gaussians, projected to the view.
         width, height: pixels.
-        columns: F, numbers a Gaussian.
-        values: gives (B, L, F) of a block of pairs: sums over the 64 pixels of each tile.
+        columns: F, values per Gaussian.
+        values: returns (B, L, F) for a block of pairs: sums over the 64 pixels of each tile.
 
     Returns:
         (M, F), in the dtype of ``seen``.
@@ -66,7 +66,7 @@ def sum_over_pixels(
     starts = lists.offsets
     across = footprints.grid.columns
     xx, xy, yy = cov2d.unbind(-1)
-    # As the rasterizer keeps it: extent in x given y, and extent in y; both terms are positive.
+    # As in the rasterizer: extent in x given y, and extent in y; both terms are positive.
     shapes = [*means2d.unbind(-1), yy / det, xy / yy, 1.0 / yy, seen.opacities.detach().log2()]
     table = torch.stack(shapes, dim=-1)  # (M, 6)
     lengths, order = torch.sort(starts.diff(), descending=True)
@@ -76,7 +76,7 @@ def sum_over_pixels(
     begin = 0
     while begin < occupied:
         longest = int(lengths[begin])
-        # Arrays (B, L, 64) of 4 MB in float32, of which a walk holds a dozen.
+        # Arrays (B, L, 64) of 4 MB in float32; a walk needs a dozen of them.
         size = max(1, min(2**20 // (longest * PIXELS), occupied - begin))
         tiles = order[begin : begin + size]
         place = torch.arange(longest, device=tiles.device, dtype=torch.int64)

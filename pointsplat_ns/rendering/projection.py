@@ -1,4 +1,4 @@
-"""From 3D Gaussians to 2D Gaussians in the image of one pinhole camera (EWA splatting)."""
+"""Projects 3D Gaussians to 2D Gaussians in the image of one pinhole camera (EWA splatting)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Projected:
     ids: Tensor  # [M] int64, rows of the input, ascending
     means2d: Tensor  # [M, 2] pixels; the centre of the first pixel is (0.5, 0.5)
     depths: Tensor  # [M] along the optical axis
-    cov2d: Tensor  # [M, 3] xx, xy, yy in pixels^2, eps2d included
+    cov2d: Tensor  # [M, 3] xx, xy, yy in pixels^2, with eps2d
     det: Tensor  # [M] determinant of cov2d
-    opacities: Tensor  # [M] in (0, 1], compensation included
+    opacities: Tensor  # [M] in (0, 1], with compensation
     directions: Tensor  # [M, 3] from the camera centre, world space
     radii: Tensor  # [M] int32, pixels, 3 standard deviations of the longest axis
-    depth_keys: Tensor  # [M] depth minus that of the nearest; the key of the drawing order
+    depth_keys: Tensor  # [M] depth minus that of the nearest; the sort key for drawing
 
     @property
     def conics(self) -> Tensor:
@@ -40,19 +40,19 @@ class Projected:
         return torch.stack([yy, -xy, xx], dim=-1) / self.det[:, None]
 
     def select(self, rows: Tensor) -> Projected:
-        """Some of the Gaussians, by their rows (int64)."""
+        """A selection of the Gaussians, by rows (int64)."""
         return Projected(
             **{f.name: getattr(self, f.name).index_select(0, rows) for f in fields(self)}
         )
 
 
 def camera_centre(viewmat: Tensor) -> Tensor:
-    """Position of the camera in the world, (3,), of a matrix (4, 4) on the CPU in float64: the
+    """Position of the camera in the world, (3,), from a matrix (4, 4) on the CPU in float64: the
     solution of ``R c = -t``.
 
-    Solved rather than ``-R^T t``: a rotation stored in float32 is orthogonal to 1e-7 only, which a
-    translation of 1e6 turns into a tenth of a unit. Raises ValueError if the matrix is not finite,
-    its rotation cannot be inverted, or its last row is not 0, 0, 0, 1.
+    Solved instead of ``-R^T t``, because a rotation stored in float32 is orthogonal only to 1e-7,
+    which a translation of 1e6 turns into a tenth of a unit. Raises ValueError if the matrix is not
+    finite, its rotation cannot be inverted, or its last row is not 0, 0, 0, 1.
     """
     rows = viewmat.tolist()
     centre, singular = torch.linalg.solve_ex(viewmat[:3, :3], -viewmat[:3, 3])
@@ -60,15 +60,15 @@ def camera_centre(viewmat: Tensor) -> Tensor:
         raise ValueError(f"viewmat is {rows}; expected finite numbers and a rotation")
     if not _close(rows[3], (0.0, 0.0, 0.0, 1.0)):
         raise ValueError(
-            f"viewmat has the last row {rows[3]}; expected 0, 0, 0, 1: it takes world to camera, "
-            "row by row"
+            f"viewmat has the last row {rows[3]}; expected 0, 0, 0, 1: a row-major "
+            "world-to-camera matrix"
         )
     return centre
 
 
 def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
-    """Whether numbers of a camera are what they should be, up to the rounding of a matrix that was
-    inverted."""
+    """Whether numbers of a camera have the expected values, up to the rounding of an inverted
+    matrix."""
     return all(abs(value - right) <= 1e-5 for value, right in zip(values, wanted, strict=True))
 
 
@@ -76,7 +76,7 @@ def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
 def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
     """Number of Gaussians (N, ...) that no camera can draw: a NaN or infinite parameter, a negative
     scale or opacity."""
-    # one NaN or infinity spoils a sum, so a clean scene costs four sums and one answer
+    # a NaN or Inf makes a sum NaN or Inf, so a clean scene costs four sums and one transfer
     total = means.sum() + quats.sum() + scales.sum() + opacities.sum()
     if bool(total.isfinite() & ~(scales < 0).any() & ~(opacities < 0).any()):
         return 0
@@ -87,22 +87,21 @@ def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: T
 
 
 def drawn_antialiased(scene: Gaussians, view: View | Views) -> bool:
-    """Whether a picture is antialiased: because the scene is, or the view."""
+    """Whether an image is antialiased: if the scene or the view is."""
     return scene.antialiased or view.rasterize_mode == "antialiased"
 
 
 def project_scene(scene: Gaussians, view: View) -> Projected:
-    """Projection of a scene to a view, as in :func:`~pointsplat_ns.render`, on the scene's
-    device."""
+    """Project a scene to a view, as in :func:`~pointsplat_ns.render`, on the scene's device."""
     return project(scene.means, scene.quats, scene.stds, scene.alphas, camera_to(scene, view))
 
 
 class Camera(NamedTuple):
-    """A pinhole camera, on the CPU in float64, where its few numbers are computed with.
+    """A pinhole camera, on the CPU in float64, where its few numbers are computed.
 
-    float32 would move a camera that is far from the origin. On a GPU each number that Python looks
-    at would wait for all that was drawn before, and torch's linear algebra must not be called there
-    first from several threads at once.
+    float32 would move a camera that is far from the origin. On a GPU, reading each number would
+    wait for all earlier work, and torch's linear algebra must not be initialised there from several
+    threads at once.
     """
 
     rotation: Tensor  # [3, 3] world to camera
@@ -125,7 +124,7 @@ def camera_to(scene: Gaussians, view: View) -> Camera:
 
 
 def camera_of(
-    # [4, 4] world to camera, OpenCV axes; on any device, to which its gradient returns
+    # [4, 4] world to camera, OpenCV axes; on any device, which also receives its gradient
     viewmat: Tensor,
     K: Tensor,  # [3, 3]; on any device
     width: int,
@@ -140,18 +139,18 @@ def camera_of(
     raises ValueError if a focal length is zero, or the camera is not finite, has skew or is not a
     rigid motion."""
     viewmat, K = (matrix.to(device="cpu", dtype=torch.float64) for matrix in (viewmat, K))
-    # R (m - c) and not R m + t: far from the origin the first rounds alike for all Gaussians
+    # R (m - c) instead of R m + t: far from the origin it rounds alike for all Gaussians
     centre = camera_centre(viewmat)
     (fx, skew, cx), (below, fy, cy), last = K.tolist()
     if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx == 0 or fy == 0:
         raise ValueError(
             f"K has fx {fx}, fy {fy}, cx {cx}, cy {cy}; expected finite numbers and focal lengths "
-            "not 0"
+            "other than 0"
         )
     if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
         raise ValueError(
-            f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the "
-            "last row"
+            f"K is {K.tolist()}; expected no skew: zeros except for fx, fy, cx, cy and the 1 in "
+            "the last row"
         )
     lens = Lens(
         fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased
@@ -160,7 +159,7 @@ def camera_of(
 
 
 def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
-    """The :class:`Camera` of kernels."""
+    """The :class:`Camera` as a struct for kernels."""
     rotation = tuple(view.flatten().tolist())
     steepness = lens.steepness()
     (low_x, high_x), (low_y, high_y) = lens.clamps()
@@ -191,22 +190,22 @@ def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
 
 
 def scene_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Struct:
-    """The Gaussians of kernels, from contiguous tensors."""
+    """The Gaussians as a struct for kernels, from contiguous tensors."""
     return KERNELS.structs["Scene"](
         means=means, quats=quats, scales=scales, opacities=opacities, count=len(means)
     )
 
 
 def kept_rows(counts: Tensor) -> Tensor:
-    """Rows of the Gaussians that kernels keep, of each range of them the first ones, ``counts``
-    (ranges,) int64."""
+    """Rows of the visible Gaussians in the kernels' output, which are first in each range;
+    ``counts`` (ranges,) int64."""
     before = torch.cumsum(counts, 0) - counts
     starts = KERNELS.library.pointsplat_range() * torch.arange(len(counts), **INDICES) - before
     return torch.arange(int(counts.sum()), **INDICES) + starts.repeat_interleave(counts)
 
 
 def depths_behind_nearest(depths: Tensor) -> Tensor:
-    """Depths (M,) float64 minus the least, in float32: the key of the drawing order."""
+    """Depths (M,) float64 minus the minimum, as float32: the sort key for drawing."""
     return (depths - depths.amin() if len(depths) else depths).float()
 
 
@@ -220,16 +219,15 @@ class CompiledProject(torch.autograd.Function):
         scene = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
         count = means.shape[0]
         counts = torch.empty(-(-count // library.pointsplat_range()), **INDICES)
-        seen = torch.empty(
-            count, library.pointsplat_seen() // 4, **FLOATS
-        )  # each range's from where the range begins
+        # each range starts at its first Gaussian
+        seen = torch.empty(count, library.pointsplat_seen() // 4, **FLOATS)
         camera = camera_struct(view, centre, lens)
         task = KERNELS.structs["Projection"](
             camera=camera, scene=scene_struct(*scene), seen=seen, counts=counts
         )
         on_threads(count >= SEVERAL, library.pointsplat_project, task)
 
-        # the fields of the struct Seen, in numbers of four bytes
+        # fields of the struct Seen, in units of four bytes
         parts = seen.index_select(0, kept_rows(counts)).split([2, 2, 2, 1, 3, 1, 1, 3, 1], dim=1)
         exact, ids, means2d, depths, cov2d, det, alphas, directions, radii = (
             part.contiguous() for part in parts
@@ -286,7 +284,7 @@ class CompiledProject(torch.autograd.Function):
         on_threads(len(scene[0]) >= SEVERAL, library.pointsplat_project_backward, task)
         grad_view = grad_centre = None
         if sums is not None:
-            # NumPy sums on one thread, so the rounding does not depend on their number
+            # NumPy sums on one thread, so the rounding does not depend on the number of threads
             total = torch.from_numpy(sums.numpy().sum(0))
             grad_view = total[:9].view(3, 3)
             grad_centre = total[9:]
@@ -301,12 +299,12 @@ def project(
     camera: Camera,
     compiled: bool | None = None,
 ) -> Projected:
-    """Project the Gaussians that one camera sees; the others are left out.
+    """Project the Gaussians that one camera sees, and drop the others.
 
-    Left out are Gaussians with a non-finite parameter or a negative scale, nearer than
+    Dropped are Gaussians with a non-finite parameter or a negative scale, nearer than
     ``near_plane`` or farther than ``far_plane``, fainter than 1/255, or whose 1/255 ellipse misses
     every pixel centre. Differentiable in means, quats, scales, opacities and the camera's matrix.
-    Done in torch (:mod:`~pointsplat_ns.rendering.ewa`), or by compiled kernels where they were
+    Runs in torch (:mod:`~pointsplat_ns.rendering.ewa`), or with compiled kernels if they were
     built; ``compiled`` is that of :func:`~pointsplat_ns.rasterization`.
     """
     suited = KERNELS.usable_for(compiled, means, quats, scales, opacities)

@@ -1,16 +1,15 @@
-"""The algebra of one Gaussian on one tile: log alpha as a quadratic, and the gradient sums that
-belong to it.
+"""The algebra of one Gaussian on one tile: log alpha as a quadratic, and sums of its gradients.
 
-For one tile and one Gaussian the logarithm of alpha is a quadratic in the pixel's offset (u, v)
-from the tile's centre. All evaluations, and all sums of gradients over pixels, are therefore
-products with one 6 x 64 matrix of monomials.
+For one tile and one Gaussian, log alpha is a quadratic in the pixel's offset (u, v) from the tile's
+centre. All evaluations, and all sums of gradients over pixels, are therefore products with one
+6 x 64 matrix of monomials.
 
-The quadratic form is kept as ``a w^2 + d dv^2`` with ``w = du - r dv``, ``r = xy / yy``, ``a = yy /
-det``, ``d = 1 / yy``: the extent in x given y, and the extent in y. Both terms are positive, so a
-long needle far from its centre does not lose its alpha to the cancellation of huge terms.
-Logarithms are to base 2, as torch's ``exp2`` is four times as fast as its ``exp``.
+The quadratic form is stored as ``a w^2 + d dv^2`` with ``w = du - r dv``, ``r = xy / yy``, ``a = yy
+/ det``, ``d = 1 / yy``: the extent in x given y, and the extent in y. Both terms are positive, so a
+long needle far from its centre keeps its alpha, without cancellation of huge terms. Logarithms are
+to base 2, because torch's ``exp2`` is four times as fast as its ``exp``.
 
-Shapes: B tiles, S pairs of each, 64 = TILE * TILE pixels, D channels.
+Shapes: B tiles, S pairs per tile, 64 = TILE * TILE pixels, D channels.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from pointsplat_ns.rendering.constants import TILE
 
 PIXELS = TILE * TILE
 MOMENTS = 6
-"""Sums over pixels that are kept of each pair: of g times w, w^2, dv, dv^2, w dv and 1."""
+"""Number of sums over pixels per pair: of g times w, w^2, dv, dv^2, w dv and 1."""
 
 LOG2E = 1.0 / math.log(2.0)
 
@@ -41,10 +40,10 @@ def basis_of(like: Tensor) -> Tensor:
 def table_of(
     means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor
 ) -> Tensor:
-    """Rows that pairs gather, one for each Gaussian, (M + 1, 11 + D); the last row is padding,
-    which is never drawn.
+    """Rows that pairs gather, one per Gaussian, (M + 1, 11 + D); the last row is padding, which is
+    never drawn.
 
-    x, y (pixels), r, a, d (log2 per pixels^2), then the coefficients of log2 alpha on the basis as
+    x, y (pixels), r, a, d (log2 per pixels^2), then the coefficients of log2 alpha on the basis, as
     far as they do not depend on the tile, then the colour.
     """
     xx, xy, yy = cov2d.unbind(-1)
@@ -71,15 +70,14 @@ def table_of(
 
 
 class Quadratics(NamedTuple):
-    """Quadratics of a chunk of Gaussians in each tile of a block, and the colours of these
-    Gaussians."""
+    """Quadratics of a chunk of Gaussians in each tile of a block, and the Gaussians' colours."""
 
     s: Tensor  # [B * S] w at the tile's centre, pixels
     ey: Tensor  # [B * S] dv at the tile's centre, pixels
     r: Tensor  # [B * S]
     coefficients: Tensor  # [B * S, 6] of log2 alpha, on the basis
     colors: Tensor  # [B, S, D]
-    rows: Tensor  # [B, S, 11 + D] what the last two are views of
+    rows: Tensor  # [B, S, 11 + D] base of the last two views
 
 
 def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Quadratics:
@@ -102,7 +100,7 @@ def gather(table: Tensor, ids: Tensor, x: Tensor, y: Tensor) -> Quadratics:
 def moments(pairs: Quadratics, sums: Tensor, out: Tensor) -> None:
     """The MOMENTS of pairs, where g is the gradient of log alpha (to base e).
 
-    ``sums`` (6, B * S) are those of g times the basis. Writes (B * S, 6) columns of ``out``.
+    ``sums`` (6, B * S) are the sums of g times the basis. Writes (B * S, 6) columns of ``out``.
     """
     g, gu, gv, guu, guv, gvv = sums
     s, ey, r = pairs[:3]
@@ -119,8 +117,8 @@ def moments(pairs: Quadratics, sums: Tensor, out: Tensor) -> None:
 
 
 def mean_slopes(coefficients: Tensor) -> tuple[Tensor, Tensor]:
-    """d log alpha / d mean x and y as linear functions of (1, u, v), (B * S, 3) each, from those of
-    log2 alpha.
+    """d log alpha / d mean x and y as linear functions of (1, u, v), (B * S, 3) each, from the
+    coefficients of log2 alpha.
 
     The gradient of log alpha by the mean is minus its gradient by the pixel.
     """
@@ -131,8 +129,7 @@ def mean_slopes(coefficients: Tensor) -> tuple[Tensor, Tensor]:
 def chain(
     summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of means2d, cov2d, det and opacities from the moments of each Gaussian, (M,
-    MOMENTS)."""
+    """Gradients of means2d, cov2d, det and opacities from the moments (M, MOMENTS)."""
     w, ww, v, vv, wv, one = summed.unbind(-1)
     xx, xy, yy = cov2d.unbind(-1)
     a = yy / det

@@ -1,4 +1,4 @@
-"""The public function, called as gsplat's, in pure torch."""
+"""The public rasterization function, with gsplat's signature, in plain torch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ others, (N, K - 1, 3)."""
 
 @functools.cache
 def gsplat_works() -> bool:
-    """Whether gsplat's CUDA kernels are there. The first call may compile them, as Splatfacto's
+    """Whether gsplat's CUDA kernels are available. The first call may compile them, as Splatfacto's
     first step does."""
     if not torch.cuda.is_available():
         return False
@@ -40,8 +40,8 @@ def gsplat_works() -> bool:
 
 
 def use_gsplat(backend: str, device: torch.device) -> bool:
-    """Whether ``backend`` ("gsplat" or "auto"; others are a ValueError) means gsplat for tensors on
-    ``device``. Raises PointSplatError if gsplat is asked for and cannot be used."""
+    """Whether ``backend`` ("gsplat" or "auto"; others raise ValueError) means gsplat for tensors on
+    ``device``. Raises PointSplatError if gsplat is requested and cannot be used."""
     if backend not in ("gsplat", "auto"):
         raise ValueError(f"backend is {backend!r}; expected torch, gsplat or auto")
     usable = device.type == "cuda" and gsplat_works()
@@ -60,17 +60,16 @@ def _cat(tensors: list[Tensor], dim: int = 0) -> Tensor:
 
 def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
     """Projected Gaussians and colours without those whose colour is NaN or too large, and the ids
-    of these."""
+    of the removed ones."""
     colors = _colors_of(seen, *rest)
     dropped = seen.ids[:0]
-    # 6e30 in float32: gradients, which are sums over pixels of colours times slopes, stay finite
+    # 6e30 in float32: gradients, sums over pixels of colours times slopes, stay finite
     limit = torch.finfo(colors.dtype).max ** 0.8
-    if colors.numel() and not bool(
-        torch.stack(colors.detach().aminmax()).abs().amax() < limit
-    ):  # NaN spoils both
+    # NaN makes both comparisons false
+    if colors.numel() and not bool(torch.stack(colors.detach().aminmax()).abs().amax() < limit):
         usable = (colors.detach().abs() < limit).all(-1)
         dropped = seen.ids[~usable]
-        # evaluated again, and not selected, so that the gradient never multiplies 0 by infinity
+        # evaluated again instead of selected, so that the gradient never multiplies 0 by infinity
         seen = seen.select(usable.nonzero()[:, 0])
         colors = _colors_of(seen, *rest)
     return seen, colors, dropped
@@ -119,23 +118,22 @@ def rasterization(
 
     Called as ``gsplat.rasterization`` (1.4.0); docs/rasterizer.md lists the differences.
     Differentiable in means, quats, scales, opacities, colors, backgrounds and viewmats. float32 and
-    float64 are computed as they are, lower precisions in float32, also under autocast. float64
-    viewmats beside float32 Gaussians place the camera exactly, however far from the origin. Cameras
-    are best given on the CPU: those on a GPU are fetched from it, which waits for all that it has
-    to do.
+    float64 are computed in their own precision, lower precisions in float32, also under autocast.
+    float64 viewmats with float32 Gaussians place the camera exactly, however far from the origin.
+    Cameras should be on the CPU: from a GPU they are copied, which waits for all its pending work.
 
     Degenerate input is drawn: the zero quaternion is the identity, a scale of 0 a flat Gaussian.
     Gaussians with invalid values (NaN, infinities, a negative scale or opacity, a colour above
-    6e30, whose gradients float32 could not hold) are not drawn, get a zero gradient and are counted
-    in ``meta["skipped"]``.
+    6e30, whose gradients overflow float32) are not drawn, get a zero gradient and are counted in
+    ``meta["skipped"]``.
 
     The same input gives the same bits, forward and backward, on the same machine and number of
-    threads; by compiled kernels on any number. Otherwise images and gradients move by 1e-6 of their
-    size.
+    threads; with compiled kernels on any number. Otherwise images and gradients differ by 1e-6 of
+    their size.
 
     Args:
         means: centres, world space.
-        quats: wxyz, any length; one of less than 1e-38 is the identity.
+        quats: wxyz, any length; shorter than 1e-38 is the identity.
         scales: standard deviations (not logarithms), scene units.
         opacities: in [0, 1].
         colors: D channels, or SH coefficients if ``sh_degree`` is given: one tensor, or two with
@@ -145,23 +143,23 @@ def rasterization(
         near_plane, far_plane: depths drawn, scene units.
         radius_clip: Gaussians of a smaller radius (pixels) are not drawn.
         eps2d: added to the diagonal of the projected covariance, pixels^2.
-        sh_degree: degree evaluated; must not exceed what ``colors`` holds.
-        packed: as in gsplat, ``meta`` then lists the M visible (camera, Gaussian) pairs in place of
+        sh_degree: degree to evaluate, at most that of ``colors``.
+        packed: as in gsplat, ``meta`` then lists the M visible (camera, Gaussian) pairs instead of
             (C, N) arrays.
         backgrounds: (C, D), one colour a camera; depth channels are not composited over it.
-        render_mode: colours, depth ``D`` (sum of weight times depth), expected depth ``ED`` (that
-            divided by the accumulated alpha), or both.
+        render_mode: colours, depth ``D`` (sum of weight times depth), expected depth ``ED``
+            (``D`` divided by accumulated alpha), or both.
         absgrad: the backward pass adds the sum over pixels of the absolute gradient (AbsGS, arXiv
             2404.10484) to ``meta["means2d"].absgrad``.
         rasterize_mode: ``antialiased`` scales opacities by the compensation of Mip-Splatting.
-        backend: renderer. "gsplat" calls gsplat itself, which needs CUDA; "auto" does so where it
-            can. The arguments below have no effect on gsplat.
-        quality: by which lowest alpha to trade accuracy for speed; see ``QUALITIES``.
+        backend: renderer. "gsplat" calls gsplat itself, which needs CUDA; "auto" does so if
+            possible. The arguments below have no effect on gsplat.
+        quality: lowest drawn alpha, which trades accuracy for speed; see ``QUALITIES``.
         compiled: project and blend with compiled kernels, several times as fast as torch (CPU,
-            float32; blending at most four channels): None where they were built; True warns where
-            they were not; False never.
-        memory_budget: bytes that lists of pairs may take before the image is drawn in several
-            bands, one after the other; the image is the same to rounding.
+            float32; blending at most four channels): None if they were built; True warns if they
+            were not; False never.
+        memory_budget: bytes of the lists of pairs, above which the image is drawn in several bands,
+            one after the other; the image is the same up to rounding.
         tile_size, sparse_grad, channel_chunk: accepted for gsplat's sake, without effect.
 
     Returns:
@@ -171,9 +169,9 @@ def rasterization(
         visible ones are checked), and sizes.
 
     Raises:
-        ValueError: if a shape or option does not fit, or a camera has skew or is not a rigid
-            motion; the text names the argument.
-        PointSplatError: if gsplat is asked for and cannot be used.
+        ValueError: if a shape or option is invalid, or a camera has skew or is not a rigid motion;
+            the message names the argument.
+        PointSplatError: if gsplat is requested and cannot be used.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -181,7 +179,8 @@ def rasterization(
         >>> views = ps.sample_views(room, 2, width=64, height=48)
         >>> renders, alphas, meta = ps.rasterization(
         ...     room.means, room.quats, room.stds, room.alphas, room.sh,
-        ...     views.viewmats.float(), views.Ks.float(), width=64, height=48, sh_degree=room.sh_degree,
+        ...     views.viewmats.float(), views.Ks.float(), width=64, height=48,
+        ...     sh_degree=room.sh_degree,
         ... )
         >>> tuple(renders.shape), tuple(alphas.shape)
         ((2, 48, 64, 3), (2, 48, 64, 1))
@@ -285,7 +284,7 @@ def rasterization(
     counts = [len(s.ids) for s in seen]
     if absgrad:
         absolute = torch.zeros_like(meta_means2d.detach())
-        setattr(meta_means2d, "absgrad", absolute)  # noqa: B010 - where gsplat puts it, on the tensor itself
+        setattr(meta_means2d, "absgrad", absolute)  # noqa: B010 - as in gsplat
         rows = (torch.cumsum(torch.ones_like(dense_ids), 0) - 1 if packed else dense_ids).split(
             counts
         )
@@ -296,7 +295,7 @@ def rasterization(
         one = replace(seen[c], means2d=own)
         absolute_of = (absolute.view(-1, 2), rows[c]) if absgrad else None
         values = _cat(channels, dim=-1)
-        kernels = compiled if values.shape[1] <= 4 else False  # they are made for colours and depth
+        kernels = compiled if values.shape[1] <= 4 else False  # limited to colours and depth
         footprints = Footprints(one, width, height, QUALITIES[quality], kernels)
         image, through = blend(one, values, footprints, memory_budget, absolute_of)
         images.append(image)

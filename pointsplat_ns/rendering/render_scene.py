@@ -1,4 +1,4 @@
-"""Pictures and depth images of a whole scene."""
+"""Renders images and depth maps of a whole scene."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ def render(
     quality: QualityName = "exact",
     backend: Literal["torch", "gsplat", "auto"] = "torch",
 ) -> Tensor:
-    """Render a scene from one view or several, over the views' background. Differentiable in the
-    scene. The picture is antialiased if the scene or the view is.
+    """Render a scene from one or several views, over the views' background. Differentiable in the
+    scene. The image is antialiased if the scene or the view is.
 
     Args:
-        scene: N Gaussians, on any device; the picture is rendered there.
-        views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, whose pictures are
-            then drawn one after the other.
+        scene: N Gaussians, on any device, which renders the image.
+        views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, which are rendered
+            one after the other.
         quality: "exact", or faster and less accurate, "balanced" or "fast", as for
             :func:`pointsplat_ns.rasterization`.
-        backend: "torch", or gsplat where it can be used ("auto"), as for
-            :func:`pointsplat_ns.rasterization`. gsplat leaves out tests of what it is given.
+        backend: "torch", or gsplat if it can be used ("auto"), as for
+            :func:`pointsplat_ns.rasterization`. gsplat does not check its input.
 
     Returns:
         Colours in [0, 1]: (H, W, 3) for a view, (C, H, W, 3) for C views.
 
     Raises:
-        TypeError: if ``views`` is neither.
-        ValueError: if a camera is not finite or has no focal length, or there is no such quality.
+        TypeError: if ``views`` has another type.
+        ValueError: if a camera is not finite or has no focal length, or the quality is unknown.
 
     Warns:
         UserWarning: if some Gaussians are not :meth:`~pointsplat_ns.Gaussians.usable`; their
@@ -71,8 +71,8 @@ def render_with_alpha(
     quality: QualityName = "exact",
     backend: Literal["torch", "gsplat", "auto"] = "torch",
 ) -> tuple[Tensor, Tensor]:
-    """Picture (H, W, 3) of one view and its alpha (H, W, 1), both in [0, 1]. Arguments and errors
-    are those of :func:`render`."""
+    """Image (H, W, 3) and alpha (H, W, 1) of one view, both in [0, 1]. Arguments and errors are
+    those of :func:`render`."""
     with one_thread_each():
         fixed = not (
             torch.is_grad_enabled()
@@ -93,8 +93,8 @@ def render_with_alpha(
 
 
 def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tuple[Tensor, Tensor]:
-    """Image (H, W, channels) and alphas (H, W, 1) of a scene with these colours, and more of what
-    :func:`~pointsplat_ns.rasterization` takes."""
+    """Image (H, W, channels) and alphas (H, W, 1) of a scene with given colours; ``options`` are
+    those of :func:`~pointsplat_ns.rasterization`."""
     image, alpha, meta = rasterization(
         means=scene.means,
         quats=scene.quats,
@@ -106,7 +106,7 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
         width=view.width,
         height=view.height,
         near_plane=view.near_plane,
-        far_plane=math.inf,  # the unit of length may be small
+        far_plane=math.inf,  # scene units may be large, so depths may be small or large
         rasterize_mode="antialiased" if drawn_antialiased(scene, view) else "classic",
         eps2d=view.eps2d,
         **options,
@@ -116,27 +116,27 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
 
 
 def _warn_of(skipped: int, scene: Gaussians) -> None:
-    """Warn of Gaussians that are not drawn because of their values, once for each number of
+    """Warn about Gaussians with invalid values, which are not drawn; once for each number of
     them."""
     if skipped:
         text = f"{skipped} of {len(scene)} Gaussians have NaN or infinite values and are not drawn"
-        warnings.warn(text, stacklevel=1)  # of one line, so that one text is shown once
+        warnings.warn(text, stacklevel=1)  # from one line, so that Python shows each text once
 
 
 def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
-    """Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1], of
-    each pixel of a view. The images are rendered on the scene's device."""
+    """Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1], for
+    each pixel of a view. Rendered on the scene's device."""
     with one_thread_each():
-        colors = scene.means  # any: only depths are rendered
+        colors = scene.means  # unused: only depths are rendered
         depth, alpha = _rasterized(scene, view, colors, render_mode="ED")
     return depth[..., 0], alpha[..., 0]
 
 
 def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Tensor:
-    """Visible pixels of each Gaussian, (N,), at least float32: the sum over the pixels of a picture
-    of its blending weight, which is its alpha times the transmittance in front of it. It is the
-    gradient of the sum of the picture by the colour, and 0 where the view does not show the
-    Gaussian. ``compiled`` is that of :func:`pointsplat_ns.rasterization`."""
+    """Visible pixels of each Gaussian, (N,), at least float32: its blending weight, alpha times the
+    transmittance in front of it, summed over the pixels of an image. Equals the gradient of the sum
+    of the image by the colour; 0 if the Gaussian is not visible. ``compiled`` is that of
+    :func:`pointsplat_ns.rasterization`."""
     with one_thread_each():
         if pictures.can_draw(single := _at_least_single(scene), compiled):
             weights = pictures.weights(single, camera_to(scene, view), ALPHA_MIN)
@@ -148,8 +148,8 @@ def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Ten
 
 
 def pixel_sums(scene: Gaussians, view: View, maps: Tensor, compiled: bool | None = None) -> Tensor:
-    """Sums (N, D) over the pixels of a view of the blending weight of each Gaussian times the
-    values of D maps, (H, W, D): :func:`pixels_of` for a map of ones."""
+    """Sums (N, D) over the pixels of a view of each Gaussian's blending weight times the values of
+    D maps, (H, W, D); a map of ones gives :func:`pixels_of`."""
     scene = _at_least_single(scene)
     with one_thread_each(), torch.enable_grad():
         colors = torch.zeros(

@@ -1,5 +1,4 @@
-"""Colours of Gaussians from real spherical harmonics up to degree 3: in torch, or by compiled
-kernels."""
+"""Colours of Gaussians from real spherical harmonics up to degree 3, in torch or C++."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ from pointsplat_ns.system.tensors import full_precision
 
 
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
-    """Gradient (3, M) by the unit direction, from the gradients ((degree + 1)^2, M) of the
+    """Gradient (3, M) of the unit direction, from the gradients ((degree + 1)^2, M) of the
     basis."""
     x, y, z = unit
     gx = -C1 * grad[3]
@@ -75,21 +74,21 @@ def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
 
 
 def _blocks(count: int, on_cpu: bool) -> list[slice]:
-    """Pieces of the work: on a CPU the coefficients of one piece stay in the cache, and no copy of
-    all is made."""
-    # On a CPU 0.8 MB of coefficients at degree 3 at once.
+    """Pieces of the work: on a CPU the coefficients of one piece stay in the cache, and are not
+    copied as a whole."""
+    # On a CPU 0.8 MB of coefficients per piece at degree 3.
     step = 4096 if on_cpu else max(count, 1)
     return [slice(start, min(start + step, count)) for start in range(0, count, step)]
 
 
 def offset(color: Tensor) -> Tensor:
-    """Add the 1/2 of 3DGS, and turn infinities to NaN: a lower bound of 0 would hide that one has
-    no meaning."""
+    """Add the 1/2 of 3DGS, and turn infinities into NaN, because the lower bound of 0 would hide
+    them."""
     return (color - color) + (color + 0.5)
 
 
 class Color(torch.autograd.Function):
-    """Colours of some rows of SH coefficients; see :func:`sh_to_color`."""
+    """Colours of selected rows of SH coefficients; see :func:`sh_to_color`."""
 
     @staticmethod
     def forward(ctx, directions, first, rest, ids, degree):
@@ -140,7 +139,7 @@ def _rows(first: Tensor, rest: Tensor, ids: Tensor, degree: int) -> Tensor:
 
 
 class CompiledColor(torch.autograd.Function):
-    """As :class:`Color`, by compiled kernels (``compiled/colors.cpp``)."""
+    """As :class:`Color`, with compiled kernels (``compiled/colors.cpp``)."""
 
     @staticmethod
     def forward(ctx, directions, first, rest, ids, degree):
@@ -164,7 +163,7 @@ class CompiledColor(torch.autograd.Function):
     def backward(ctx, grad):
         directions, first, rest, ids, colors = ctx.saved_tensors
         wanted = ctx.needs_input_grad
-        # a constant has no direction
+        # the constant basis function has no gradient by direction
         of_directions = torch.empty_like(directions) if wanted[0] and ctx.degree else None
         of_first = zeros_like(first) if wanted[1] else None
         of_rest = zeros_like(rest) if wanted[2] else None
@@ -184,8 +183,8 @@ class CompiledColor(torch.autograd.Function):
 
 
 def zeros_like(coefficients: Tensor) -> Tensor:
-    """By NumPy, which takes memory that the system has zeroed: rows that are not seen are not
-    written, nor paid for."""
+    """Zeros from NumPy, which uses memory that the system zeroes lazily: rows of invisible
+    Gaussians are never written and cost nothing."""
     return torch.from_numpy(np.zeros(coefficients.shape, np.float32))
 
 
@@ -213,8 +212,8 @@ def _call_kernels(
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, and a degree of 0
-    to 3."""
+    """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, at degree 0 to
+    3."""
     return torch.stack(basis_rows(directions.movedim(-1, 0), degree), dim=-1)
 
 
@@ -226,20 +225,19 @@ def sh_to_color(
     ids: Tensor,
     compiled: bool | None = None,
 ) -> Tensor:
-    """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
+    """Colours seen along directions, as defined by 3DGS: ``max(SH + 1/2, 0)``.
 
     Args:
         directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero
-            direction sees the basis at zero.
+            direction gives the basis at zero.
         first: (N, 3) constant SH coefficients.
-        rest: (N, K - 1, 3) the others; K >= (degree + 1)^2, what is beyond is ignored.
+        rest: (N, K - 1, 3) the others; K >= (degree + 1)^2, higher ones are ignored.
         degree: 0 to 3.
-        ids: (M,) int64, each at most once: the row of the coefficients that each direction belongs
-            to.
+        ids: (M,) int64, distinct: row of the coefficients for each direction.
         compiled: as for :func:`~pointsplat_ns.rasterization`.
 
     Returns:
-        (M, 3), not below 0; NaN where a coefficient is not finite.
+        (M, 3), at least 0; NaN if a coefficient is not finite.
 
     Raises:
         ValueError: if the degree is not 0 to 3, or there are too few coefficients.
@@ -251,7 +249,7 @@ def sh_to_color(
     if stored < used:
         raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")
     if KERNELS.usable_for(compiled, directions, first, rest):
-        # a constant has no direction
+        # the constant basis function has no gradient by direction
         return CompiledColor.apply(
             directions if degree else directions.detach(), first, rest, ids, degree
         )

@@ -1,8 +1,8 @@
-"""The tiles that each Gaussian touches, exactly, in drawing order.
+"""The exact set of tiles that each Gaussian touches, in drawing order.
 
-A Gaussian is paired with a tile only if its own 1/255 ellipse meets the box of the tile's pixel
-centres: over each row of tiles the ellipse's extent in x is known in closed form, and the tiles
-that it covers are an interval.
+A Gaussian is paired with a tile only if its 1/255 ellipse intersects the box of the tile's pixel
+centres. Within each row of tiles, the ellipse's extent in x has a closed form, and the touched
+tiles are an interval.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pointsplat_ns.system.kernels import KERNELS
 
 
 class Footprints:
-    """The ellipses of projected Gaussians within which they are drawn, in depth order, found in
-    torch (:mod:`~pointsplat_ns.rendering.ellipses`) or by compiled kernels.
+    """Ellipses within which projected Gaussians are drawn, in depth order, computed in torch
+    (:mod:`~pointsplat_ns.rendering.ellipses`) or with compiled kernels.
 
     Args:
         seen: M Gaussians.
         width, height: of the image, pixels.
-        alpha_min: a Gaussian is not drawn where its alpha is lower.
+        alpha_min: a Gaussian with a lower alpha is not drawn.
         compiled: as for :func:`~pointsplat_ns.rasterization`.
     """
 
@@ -45,8 +45,9 @@ class Footprints:
         self._ellipses = self._engine.ellipses_of(*shapes, order, self.grid)
 
     def regions(self, most_pairs: int) -> list[tuple[int, int]]:
-        """The image as few bands of rows of tiles, the first and one past the last, of at most
-        about ``most_pairs`` pairs each, by a bound on their number. A row is not divided."""
+        """Split the image into as few bands of rows of tiles, first and one past the last, as
+        possible, with at most about ``most_pairs`` pairs each, by an upper bound of their number. A
+        row is not split."""
         rows = self.grid.rows
         columns = self.grid.columns
         boxes = self._ellipses.boxes
@@ -55,7 +56,7 @@ class Footprints:
         row0, row1, column0, column1 = boxes.long().unbind(1)
         heights = (row1 - row0 + 1).clamp_min_(0)
         widths = (column1 - column0 + 1).clamp_min_(0)
-        if int((heights * widths).sum()) <= most_pairs:  # boxes around the ellipses
+        if int((heights * widths).sum()) <= most_pairs:  # bounding boxes of the ellipses
             return [(0, rows)]
         steps = torch.zeros(rows + 1, dtype=torch.int64, device=boxes.device)
         steps.index_add_(0, row0, widths).index_add_(0, row0 + heights, -widths)
@@ -72,8 +73,8 @@ class Footprints:
 
     @torch.no_grad()
     def tiles(self, top: int = 0, bottom: int | None = None) -> TileList:
-        """Pair Gaussians with the tiles of the rows from ``top`` on before ``bottom``, by default
-        of all, and sort the pairs by tile, then depth, then row of the input."""
+        """Pair Gaussians with the tiles of the rows from ``top`` up to, but not including,
+        ``bottom``, by default all rows; sorted by tile, then depth, then input row."""
         return self._engine.pairs_of(
             self._ellipses, self.grid, top, self.grid.rows if bottom is None else bottom
         )

@@ -1,9 +1,8 @@
-"""Pictures by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one
-pass over the Gaussians, then blending as for any picture
-(:mod:`~pointsplat_ns.rendering.compiled.blending_kernels`). Gradients by the parameters of a scene take
-another pass.
+"""Images with compiled kernels (``compiled/whole_pictures.cpp``).
 
-:func:`~pointsplat_ns.rasterization` gives the same pictures and gradients to rounding.
+Projection, colours and tiles take one pass over the Gaussians, followed by the usual blending
+(:mod:`~pointsplat_ns.rendering.compiled.blending_kernels`). Gradients of a scene's parameters take another
+pass. :func:`~pointsplat_ns.rasterization` gives the same images and gradients up to rounding.
 """
 
 from __future__ import annotations
@@ -28,18 +27,18 @@ from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 
 MOST_PAIRS = MEMORY_BUDGET // 16
-"""Largest number of pairs of Gaussian and tile in one pass, of 12 bytes each; pictures of more are
-drawn by regions."""
+"""Maximum number of pairs of Gaussian and tile in one pass, of 12 bytes each; larger images are
+drawn in regions."""
 
 
 class _Placed(NamedTuple):
-    """What one camera sees of a scene."""
+    """The Gaussians of a scene that one camera sees."""
 
     grid: Grid
-    # [N, 6 + channels], as of :func:`blending.inputs_of`, rows of Gaussians that are drawn
+    # [N, 6 + channels], as of :func:`blending.inputs_of`; rows of visible Gaussians
     table: Tensor
     tiles: TileList
-    ids: Tensor  # [M] int64, the Gaussians that are drawn, ascending
+    ids: Tensor  # [M] int64, the visible Gaussians, ascending
     task: Struct  # of the kernel
     skipped: int  # number of Gaussians with invalid values
 
@@ -48,9 +47,9 @@ class _Placed(NamedTuple):
 def _placed(
     scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, taped: bool = False
 ) -> _Placed | None:
-    """What a camera sees, with or without colours, with all that gradients need if it is ``taped``;
-    None if the pairs are more than :data:`MOST_PAIRS`, or than gradients of 192 bytes each have
-    memory for."""
+    """The Gaussians that a camera sees, with or without colours, and with the lists for gradients
+    if ``taped``; None if there are more than :data:`MOST_PAIRS` pairs, or too little memory for
+    gradients of 192 bytes per pair."""
     library = KERNELS.library
     count = len(scene)
     tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
@@ -87,7 +86,7 @@ def _placed(
 
 
 class _Picture(torch.autograd.Function):
-    """Picture and alpha from the parameters of a scene, which was placed."""
+    """Image and alpha from the parameters of a scene that was placed."""
 
     @staticmethod
     def forward(ctx, placed: _Placed, background: Tensor, *parameters: Tensor):
@@ -124,7 +123,7 @@ class _Picture(torch.autograd.Function):
         sums = blending.differentiate_region(
             placed.grid, placed.tiles, placed.table, ctx.tape, ctx.final, by_color, by_final, False
         )
-        # in the order of the fields of a scene
+        # in the order of the scene's fields
         names = ("means", "scales", "quats", "opacities", "first", "rest")
         wanted = zip(names, parameters, ctx.needs_input_grad[2:], strict=True)
         out = {name: zeros_like(value) if needed else None for name, value, needed in wanted}
@@ -138,9 +137,9 @@ class _Picture(torch.autograd.Function):
 def picture(
     scene: Gaussians, camera: Camera, background: Tensor, alpha_min: float
 ) -> tuple[Tensor, Tensor, int] | None:
-    """Picture (H, W, 3) over a background (3,), in [0, 1], alpha (H, W, 1), both differentiable in
-    the scene, and the number of Gaussians with invalid values (colours are checked in view); None
-    if the pairs of Gaussians and tiles are too many for one pass."""
+    """Image (H, W, 3) over a background (3,), in [0, 1], and alpha (H, W, 1), both differentiable
+    in the scene; and the number of Gaussians with invalid values (colours are checked only in
+    view). None if there are too many pairs of Gaussian and tile for one pass."""
     taped = torch.is_grad_enabled() and any(value.requires_grad for value in scene.tensors())
     placed = _placed(scene, camera, True, alpha_min, taped)
     return placed and (
@@ -150,7 +149,7 @@ def picture(
 
 
 def weights(scene: Gaussians, camera: Camera, alpha_min: float) -> Tensor | None:
-    """Blending weight of each Gaussian, summed over the pixels of a picture, (N,); None as for
+    """Blending weight of each Gaussian, summed over the pixels of an image, (N,); None as for
     :func:`picture`."""
     placed = _placed(scene, camera, False, alpha_min)
     if placed is None:
@@ -162,6 +161,6 @@ def weights(scene: Gaussians, camera: Camera, alpha_min: float) -> Tensor | None
 
 
 def can_draw(scene: Gaussians, wanted: bool | None) -> bool:
-    """Whether the kernels draw a scene: float32, on a CPU. ``wanted`` as ``compiled`` of
+    """Whether the kernels can draw a scene: float32, on a CPU. ``wanted`` is as ``compiled`` of
     :func:`~pointsplat_ns.rasterization`."""
     return KERNELS.usable_for(wanted, scene.means)

@@ -1,1 +1,1 @@
-"""What a scene is, and how it is read and written: Gaussians, views, PLY, runs, other formats."""
+"""Scenes and their files: Gaussians, views, trained runs, PLY and other formats."""

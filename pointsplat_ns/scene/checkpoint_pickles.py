@@ -1,11 +1,11 @@
-"""Bounds what loading a checkpoint takes, before torch loads it.
+"""Bounds the memory of loading a checkpoint, before torch loads it.
 
-torch's ``weights_only`` runs no code of a file, but lets it call constructors with arguments of its
-own: ``bytearray(n)`` takes n bytes. Here the pickle in a checkpoint is followed, opcode by opcode,
-without building what it describes. It may call what Splatfacto, gsplat's and INRIA's trainers and
-this package's write, and the sizes that it names must fit into the file.
+torch's ``weights_only`` mode runs no code of the file, but lets it call constructors with any
+arguments: ``bytearray(n)`` takes n bytes. This module steps through the checkpoint's pickle opcode
+by opcode without building its objects. Only the constructors that Splatfacto, gsplat's, INRIA's and
+this package's trainers write are allowed, and declared sizes must fit into the file.
 
-Source: the opcodes are those of :mod:`pickletools`, protocol 2, which ``torch.save`` writes.
+Source: the opcodes of :mod:`pickletools`, protocol 2, which ``torch.save`` writes.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from typing import Any, BinaryIO
 from pointsplat_ns.system.opening import open_regular
 
 MOST_PICKLED = 1 << 21
-"""Largest pickle, bytes. Those of Splatfacto have some thousands; tensors are not in it. A byte may
-become an empty list of 64."""
+"""Maximum size of a pickle, bytes. Splatfacto's have some thousands; tensors are separate. One
+byte may become an empty list of 64 bytes."""
 
 MOST_CALLS = 100_000
-"""Largest number of tensors and other objects. Those of Splatfacto have some dozens. One takes up
-to 1 kB and five bytes of a pickle."""
+"""Maximum number of tensors and other objects. Splatfacto's checkpoints have some dozens. An object
+takes up to 1 kB of memory and five bytes of a pickle."""
 
 _MAGIC = 0x1950A86A20F9469CFC6C
-"""First number of a file by torch before version 1.6, and with ``_use_new_zipfile_serialization``
-False."""
+"""First number of a file that torch wrote before version 1.6, or with
+``_use_new_zipfile_serialization=False``."""
 
 _STORAGES = {
     "torch ByteStorage": 1,
@@ -46,16 +46,16 @@ _STORAGES = {
     "torch LongStorage": 8,
     "torch DoubleStorage": 8,
 }
-"""Types of storages, and bytes of one of their numbers."""
+"""Storage types, and bytes of their numbers."""
 
 
 class PickleRefused(ValueError):
-    """A pickle that asks for more than a checkpoint needs."""
+    """A pickle that takes too much memory, or that no trainer writes."""
 
 
 @dataclass(frozen=True)
 class _Global:
-    name: str  # module and name, with a space between
+    name: str  # module and name, separated by a space
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class _Storage:
 
 
 class _Made:
-    """A value that is not built: a container, a tensor or a result of a call."""
+    """Stand-in for a value that is not built: a container, a tensor or a result of a call."""
 
     def __init__(self, kind: str):
         self.kind = kind
@@ -77,10 +77,10 @@ def need_bounded(path: Path) -> None:
     """Raise unless loading a checkpoint takes memory in proportion to its size.
 
     Raises:
-        PickleRefused: if the pickle asks for more, names a function that no trainer writes, or is
-            none.
+        PickleRefused: if the pickle takes more memory, names a function that no trainer writes, or
+            is not a pickle.
         OSError: if the file cannot be read.
-        zipfile.BadZipFile: if it is a damaged archive.
+        zipfile.BadZipFile: if the archive is damaged.
     """
     with open_regular(path) as stream:
         size = path.stat().st_size
@@ -91,14 +91,14 @@ def need_bounded(path: Path) -> None:
             return
         follower = _Follower(io.BytesIO(stream.read(MOST_PICKLED)), size)
         if follower.follow() != _MAGIC:
-            raise PickleRefused("not a checkpoint of torch")
+            raise PickleRefused("not a torch checkpoint")
         for _ in ("protocol version", "system", "content", "keys of the storages"):
             follower.follow()
 
 
 def _pickle_in(stream: BinaryIO, size: int) -> bytes:
-    """The pickle of torch's archive, which must be one that other readers of archives read alike:
-    torch has its own."""
+    """The pickle of torch's archive. Python and torch read archives with different code, so the
+    archive must be unambiguous."""
     with zipfile.ZipFile(stream) as archive:
         entries = archive.infolist()
         if sum(entry.file_size for entry in entries) > size or any(
@@ -122,28 +122,28 @@ def _last(name: str) -> str:
 
 
 def _directory(stream: BinaryIO, size: int) -> int:
-    """Where the directory of an archive begins, as its end says, which Python's reader moves along
-    with bytes before the archive."""
+    """Offset of an archive's directory, as its end record declares it. Python's reader shifts this
+    offset if bytes precede the archive."""
     stream.seek(max(0, size - 98))
     tail = stream.read(98).rjust(98, b"\0")
     place = struct.unpack_from("<I", tail, 92)[0]
-    if tail[56:60] == b"PK\x06\x07" and tail[:4] == b"PK\x06\x06":  # of 64 bits
+    if tail[56:60] == b"PK\x06\x07" and tail[:4] == b"PK\x06\x06":  # zip64
         place = struct.unpack_from("<Q", tail, 48)[0]
     return place if tail[76:80] == b"PK\x05\x06" else -1
 
 
 class _Follower:
-    """Follows pickles, one behind another in a stream, of a file of a size in bytes."""
+    """Follows consecutive pickles in a stream, of a file of ``size`` bytes."""
 
     def __init__(self, stream: BinaryIO, size: int):
         self._stream = stream
         self._size = size
-        self._stored: dict[str, int] = {}  # bytes of each storage by its key
-        self._total = 0  # bytes of all
+        self._stored: dict[str, int] = {}  # bytes of each storage by key
+        self._total = 0  # bytes of all storages
         self._calls = 0
 
     def follow(self) -> Any:
-        """The value of the next pickle: a number, text or a stand-in. Raises PickleRefused."""
+        """The value of the next pickle: a number, text or stand-in. Raises PickleRefused."""
         stack: list[Any] = []
         memo: dict[Any, Any] = {}
         try:
@@ -194,7 +194,7 @@ class _Follower:
         elif name == "REDUCE":
             arguments, function = stack.pop(), stack.pop()
             if not isinstance(function, _Global) or not isinstance(arguments, tuple):
-                raise PickleRefused("a call of no function")
+                raise PickleRefused("a call of a value that is not a function")
             if function.name not in _CALLS:
                 raise PickleRefused(f"a call of {function.name}")
             self._calls += 1
@@ -227,7 +227,7 @@ class _Follower:
 
 
 def _popped(stack: list[Any]) -> list[Any]:
-    """What lies above the last mark, taken off with the mark."""
+    """Pops the values above the last mark, and the mark."""
     last = len(stack) - 1
     while stack[last] is not _MARK:
         last -= 1
@@ -240,18 +240,18 @@ def _popped(stack: list[Any]) -> list[Any]:
 
 def _need(value: Any, *kinds: str) -> None:
     if not isinstance(value, _Made) or value.kind not in kinds:
-        raise PickleRefused("a change of what cannot be changed")
+        raise PickleRefused("a change of an immutable value")
 
 
 def _need_items(target: Any, keys: list[Any]) -> None:
-    """Keys are plain: the hash of nested tuples may take any time."""
+    """Check that keys are numbers or text: hashing nested tuples may take any time."""
     _need(target, "dict", "ordered")
     if not all(key is None or isinstance(key, (str, int, float)) for key in keys):
-        raise PickleRefused("a key that is no number and no text")
+        raise PickleRefused("a key that is neither a number nor text")
 
 
 def _need_state(state: Any, target: Any) -> None:
-    """The attributes of an ordered dictionary, or the byte order of a type of numpy's."""
+    """Check a state: attributes of an ordered dictionary, or byte order of a numpy type."""
     _need(target, "ordered", "dtype")
     if target.kind == "ordered":
         _need(state, "dict")
@@ -259,12 +259,12 @@ def _need_state(state: Any, target: Any) -> None:
         part is None or (isinstance(part, int) and abs(part) < 100) or part in ("<", ">", "|", "=")
         for part in state
     ):
-        raise PickleRefused("a type of numpy's that torch does not write")
+        raise PickleRefused("a numpy type that torch does not write")
 
 
 def _ordered(arguments: tuple) -> _Made:
     if len(arguments) > 1 or not all(isinstance(each, _Made) for each in arguments):
-        raise PickleRefused("a dictionary of no items")
+        raise PickleRefused("a dictionary built from other values than items")
     return _Made("ordered")
 
 
@@ -301,7 +301,7 @@ def _dtype(arguments: tuple) -> _Made:
 
 def _scalar(arguments: tuple) -> _Made:
     if len(arguments) != 2 or not isinstance(arguments[1], (bytes, str)):
-        raise PickleRefused("a number of numpy's that it does not write")
+        raise PickleRefused("a numpy number that numpy does not write")
     _need(arguments[0], "dtype")
     return _Made("number")
 
@@ -323,7 +323,7 @@ _CALLS: dict[str, Callable[[tuple], Any]] = {
     "numpy._core.multiarray scalar": _scalar,
     "_codecs encode": _encoded,
 }
-"""What may be called, as a pickle names it, and its stand-in."""
+"""Allowed functions by their names in a pickle, and their stand-ins."""
 
 _VALUES = frozenset(
     ("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINSTRING")

@@ -1,5 +1,4 @@
-"""Checkpoints: Splatfacto's (``nerfstudio_models/step-*.ckpt``) and gsplat's
-(``ckpts/ckpt_*_rank0.pt``)."""
+"""Reads checkpoints of Splatfacto (``step-*.ckpt``) and gsplat (``ckpts/ckpt_*_rank0.pt``)."""
 
 from __future__ import annotations
 
@@ -26,36 +25,35 @@ EXPECTED = "expected a checkpoint that Splatfacto or gsplat saved"
 
 
 def read_checkpoint(path: Path | str) -> Gaussians:
-    """Read the scene of a checkpoint of Splatfacto, or of gsplat's trainer.
+    """Read the scene of a checkpoint of Splatfacto or gsplat's trainer.
 
-    Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto
-    stores colours as logits, they are converted to SH coefficients of the same colour. The
-    ``cfg.yml`` of a training with gsplat says whether it drew antialiased.
+    Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, Splatfacto
+    stores colours as logits; they are converted to SH coefficients of the same colour. For gsplat,
+    the training's ``cfg.yml`` decides whether the scene is antialiased.
 
     Returns:
-        The scene, float32 on the CPU, in the frame of the training: for Splatfacto that of the
+        The scene, float32 on the CPU, in the training's frame: for Splatfacto, the frame of the
         run's dataparser.
 
     Raises:
-        SceneError: if the file is truncated, is no checkpoint, is one of another method, or a part
-            of one.
+        SceneError: if the file is truncated, is not a checkpoint, belongs to another method, or is
+            one of several parts.
     """
     path = require_file(path, "a checkpoint")
     named = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)
     if named is not None and path.with_name(f"{named[1]}1.pt").exists():
         raise SceneError(
-            f"{path}: a part of a training on several GPUs; expected the whole scene; export a "
-            "PLY with --save_ply"
+            f"{path}: one part of a multi-GPU training; expected the whole scene; export a PLY "
+            "with --save_ply"
         )
     content = load_checkpoint(path)
-    if isinstance(content, dict) and isinstance(
-        content.get("splats"), dict
-    ):  # of gsplat's simple_trainer
+    # gsplat's simple_trainer
+    if isinstance(content, dict) and isinstance(content.get("splats"), dict):
         scene = _scene_of_gsplat(content["splats"], path)
         return scene.replace(antialiased=_gsplat_antialiased(path))
     state = _pipeline_state(content, path)
-    # Of current versions, and of those before nerfstudio 1.0, each also with the wrapper of
-    # distributed training.
+    # Current versions, then those before nerfstudio 1.0; each also with the wrapper of distributed
+    # training.
     prefixes = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
     prefix = next((p for p in prefixes if f"{p}means" in state), None)
     if prefix is None:
@@ -72,8 +70,8 @@ def read_checkpoint(path: Path | str) -> Gaussians:
 
 
 def _gsplat_antialiased(path: Path) -> bool:
-    """Whether the settings of a training with gsplat, ``cfg.yml`` above the checkpoint's folder,
-    say that it drew antialiased; False if there are none."""
+    """Whether gsplat's ``cfg.yml``, above the checkpoint's folder, sets antialiased rendering;
+    False if there is no such file."""
     try:
         text = read_text(path.absolute().parents[1] / "cfg.yml", 1 << 20)
     except (OSError, ValueError, IndexError):
@@ -82,7 +80,7 @@ def _gsplat_antialiased(path: Path) -> bool:
 
 
 def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
-    """The scene of gsplat's parameters: opacities (N,), and constant SH coefficients (N, 1, 3)."""
+    """The scene of gsplat's parameters: opacities (N,), constant SH coefficients (N, 1, 3)."""
     keys = dict(zip(PARAMETERS, PARAMETERS, strict=True)) | {
         "features_dc": "sh0",
         "features_rest": "shN",
@@ -96,8 +94,8 @@ def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
 
 
 def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
-    """The scene of parameters, each with its key in the file; those that cannot be drawn
-    included."""
+    """The scene of parameters, given with their keys in the file; includes Gaussians that cannot be
+    drawn."""
     limit = path.stat().st_size
     require_memory(
         path, min(limit, sum(4 * value.numel() for _, value in values.values() if _is_dense(value)))
@@ -110,7 +108,7 @@ def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
 
 
 def _some(keys: Iterable[Any], count: int) -> str:
-    """The first of some keys, and how many more there are."""
+    """The first keys, and the number of the remaining ones."""
     names = sorted(str(key) for key in keys)
     return (", ".join(names[:count]) or "none") + (
         f" and {len(names) - count} more" if len(names) > count else ""
@@ -119,22 +117,21 @@ def _some(keys: Iterable[Any], count: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class PhotoFit:
-    """What a training learned about each of its photos, beside the scene."""
+    """Per-photo parameters of a training, stored beside the scene."""
 
     adjustments: Tensor | None
-    """(C, 6) float32: of each training photo's pose a translation in scene units, then a rotation
-    vector in radians; None if poses were not corrected."""
+    """(C, 6) float32: pose correction of each training photo, a translation in scene units and a
+    rotation vector in radians; None if poses were not optimised."""
     colors: str
     """Key of parameters that change the colours of each photo, such as a bilateral grid; empty if
     there are none."""
 
 
 def read_photo_fit(path: Path | str) -> PhotoFit:
-    """Read what a Splatfacto checkpoint holds about each training photo. Loads as
-    :func:`read_checkpoint`.
+    """Read the per-photo parameters of a Splatfacto checkpoint; loads as :func:`read_checkpoint`.
 
     Raises:
-        SceneError: if the file is no checkpoint, or its corrections of poses are not (C, 6) finite
+        SceneError: if the file is not a checkpoint, or its pose corrections are not (C, 6) finite
             numbers.
     """
     path = require_file(path, "a Splatfacto checkpoint")
@@ -157,8 +154,8 @@ def read_photo_fit(path: Path | str) -> PhotoFit:
 
 
 def read_training_state(path: Path) -> dict[str, Any]:
-    """All that a checkpoint of a nerfstudio training holds, to resume from it; its tensors are not
-    mapped. Loads as :func:`read_checkpoint`.
+    """Everything that resuming a nerfstudio training needs from its checkpoint; tensors are not
+    memory-mapped. Loads as :func:`read_checkpoint`.
 
     Raises:
         SceneError: if the file is truncated, or lacks the step, the pipeline or the optimisers.
@@ -170,7 +167,7 @@ def read_training_state(path: Path) -> dict[str, Any]:
     for name, kind in needed.items():
         if not isinstance(content, dict) or not isinstance(content.get(name), kind):
             raise SceneError(
-                f"{path}: no training can go on from it; lacks {name!r}; found {found}; {expected}"
+                f"{path}: training cannot resume; lacks {name!r}; found {found}; {expected}"
             )
     if content["step"] < 0:
         raise SceneError(f"{path}: its step is {content['step']}; {expected}")
@@ -178,18 +175,18 @@ def read_training_state(path: Path) -> dict[str, Any]:
 
 
 def is_complete(path: Path) -> bool:
-    """Whether a checkpoint's archive is complete, that is, has the directory at its end."""
+    """Whether a checkpoint's archive is complete: its directory, at the end, can be read."""
     try:
         return path.is_file() and zipfile.is_zipfile(path)
-    except (OSError, zipfile.BadZipFile):  # of an archive in several parts
+    except (OSError, zipfile.BadZipFile):  # an archive in several parts
         return False
 
 
 def allow_splatfacto_checkpoints() -> None:
-    """Register numpy's float64 scalars with torch's ``weights_only`` loader, if they are not.
+    """Allow numpy's float64 scalars in torch's ``weights_only`` loader.
 
-    Every Splatfacto checkpoint holds such a scalar in the state of its schedulers. The functions
-    registered here rebuild it from its bytes; they cannot run code from the file.
+    Splatfacto checkpoints hold such a scalar in the state of their schedulers. The registered
+    functions rebuild it from its bytes; they cannot run code from the file.
     """
     # numpy 2 renamed the module.
     scalar = importlib.import_module(
@@ -204,11 +201,11 @@ def allow_splatfacto_checkpoints() -> None:
 
 
 def load_checkpoint(path: Path, mapped: bool = True) -> Any:
-    """What a checkpoint holds, with its tensors memory-mapped if it is an archive and ``mapped``.
-    Nothing of it is run, and it takes memory in proportion to its size.
+    """Content of a checkpoint. Tensors are memory-mapped if it is an archive and ``mapped``. Runs
+    no code of the file, and takes memory in proportion to its size.
 
     Raises:
-        SceneError: if it is no checkpoint, damaged, or asks for more.
+        SceneError: if the file is not a checkpoint, is damaged, or takes more memory.
     """
     require_file(path, "a checkpoint")
     if path.stat().st_size == 0:
@@ -228,7 +225,7 @@ def load_checkpoint(path: Path, mapped: bool = True) -> Any:
     except Exception as error:  # a damaged pickle can raise nearly anything
         why = f"truncated or not a checkpoint ({type(error).__name__}: {one_line(error, 100)})"
         if foreign := re.search(r"GLOBAL ([\w.]+)", str(error)):
-            why = f"holds an object of type {foreign[1]}, which no scene needs, and is not loaded"
+            why = f"holds an object of type {foreign[1]}, which no scene needs; not loaded"
         elif isinstance(error, PickleRefused):
             why = f"truncated or not a checkpoint: {one_line(error, 100)}"
         raise SceneError(f"{path}: {why}; {EXPECTED}") from error
@@ -246,8 +243,7 @@ def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
 
 
 def _is_dense(value: Any) -> TypeGuard[Tensor]:
-    """Whether a value is a tensor of plain numbers: not one that is nested, sparse, quantised or
-    without content."""
+    """Whether a value is a dense tensor: not nested, sparse, quantised or a meta tensor."""
     if not isinstance(value, Tensor) or value.is_nested:
         return False
     floats = (torch.float16, torch.bfloat16, torch.float32, torch.float64)

@@ -21,15 +21,15 @@ from pointsplat_ns.scene.runs import RUN_FILES, Run, open_run, scene_name
 from pointsplat_ns.system.files import file_stem, logger
 
 Supervision = Literal["auto", "photos", "dense"]
-"""Training targets: a run's photos, or renders of the scene before it was pruned."""
+"""Training targets: the run's photos, or renders of the scene before pruning."""
 
 
 @dataclass(frozen=True)
 class FolderFiles:
-    """Names of files in folders that commands write."""
+    """Names of the files that commands write into folders."""
 
     scenes: str = "pointsplat-scenes.json"
-    """Command and options that all results in a folder of scenes have in common."""
+    """Command and options shared by all results in a folder of scenes."""
     scenes_table: str = "scenes.csv"
     levels: str = "lod.json"
     """Manifest of levels of detail."""
@@ -39,11 +39,15 @@ FOLDER_FILES = FolderFiles()
 
 
 def find_scenes(folder: Path | str) -> dict[str, Path]:
-    """Every scene below a folder by its name, sorted: files that hold Gaussians, named by their
-    path below the folder without a suffix, ``deep/room``, or ``room_ply`` beside ``room_spz``; and
-    the newest trained run of each experiment, by the experiment's name. Results of earlier commands
-    are passed over: files of the names that these give by default, and whole folders. Raises
-    SceneError if there is no such folder, it is a run, or there is no scene."""
+    """All scenes below a folder by name, sorted.
+
+    A file is named by its path below the folder without a suffix, ``deep/room``, or ``room_ply``
+    beside ``room_spz``. Of each experiment the newest trained run counts, under the experiment's
+    name. Results of earlier commands are skipped: files with default names, and whole folders.
+
+    Raises:
+        SceneError: if the folder is missing, is a run, or contains no scene.
+    """
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
@@ -52,10 +56,10 @@ def find_scenes(folder: Path | str) -> dict[str, Path]:
     for path in tuple(files):
         source = re.sub("_(pruned|compact|web|phone|headset|email)$", "", _stem(path))
         if source != _stem(path) and source in stems:
-            logger.warning("passed over %s: a result of %s", path, source)
+            logger.warning("skipped %s: a result of %s", path, source)
             files.remove(path)
     named = [(_stem(path.relative_to(folder)), path) for path in files]
-    with suppress(SceneError):  # no run; those passed over have been named
+    with suppress(SceneError):  # no run; skipped ones are logged already
         named += [(scene_name(run), run.folder) for run in find_runs(folder)]
     if not named:
         raise SceneError(
@@ -75,8 +79,8 @@ def find_scenes(folder: Path | str) -> dict[str, Path]:
 def find_runs_and_plys(
     folder: Path, supervision: Supervision
 ) -> tuple[dict[str, Run], dict[str, Path], SceneError | None]:
-    """The runs and PLY files at or below ``folder`` that a training uses, by their scene names, and
-    the error if no run was found. The data of runs is not looked for.
+    """The runs and PLY files at or below ``folder`` for a training, by scene name, and the error if
+    no run was found. The data of runs is not searched for.
 
     Args:
         folder: a run, a PLY file, or any folder above several.
@@ -106,15 +110,17 @@ def find_runs_and_plys(
 
 
 def find_runs(folder: Path | str) -> list[Run]:
-    """The newest run of each experiment at or below ``folder``, sorted by the experiment's name.
+    """The newest run of each experiment at or below ``folder``, sorted by experiment name.
+
     Runs of other methods and runs without a complete checkpoint are skipped. The data of runs is
-    not looked for. Raises SceneError if there is no such run, or ``folder`` is itself a run of
-    another method."""
+    not searched for.
+
+    Raises:
+        SceneError: if there is no run, or ``folder`` is a run of another method.
+    """
     folder = Path(folder)
     if not folder.exists():
-        raise SceneError(
-            f"{folder}: no such folder; expected one with trained nerfstudio runs in it"
-        )
+        raise SceneError(f"{folder}: no such folder; expected a folder of trained nerfstudio runs")
     if not folder.is_dir() or (folder / RUN_FILES.config).is_file():
         run = open_run(folder, need_data=False)
         if not run.is_gaussian_scene:
@@ -129,12 +135,12 @@ def find_runs(folder: Path | str) -> list[Run]:
         inner[:] = sorted(name for name in inner if not name.startswith("."))
         if RUN_FILES.config not in files:
             continue
-        inner.clear()  # folders in that of a run are not searched
+        inner.clear()  # no search inside of a run
         try:
             run = open_run(place, need_data=False)
         except SceneError as error:
             passed.append(str(error))
-            logger.warning("passed over: %s", error)
+            logger.warning("skipped: %s", error)
             continue
         if not run.is_gaussian_scene:
             passed.append(f"{run.folder}: method {run.method_name or 'unknown'}")
@@ -143,7 +149,7 @@ def find_runs(folder: Path | str) -> list[Run]:
         if key not in newest or _when(run) > _when(newest[key]):
             newest[key] = run
     if not newest:
-        seen = f"; passed over {len(passed)}, such as {passed[0]}" if passed else ""
+        seen = f"; skipped {len(passed)}, such as {passed[0]}" if passed else ""
         raise SceneError(
             f"{folder}: no trained Splatfacto run below it; expected "
             f"EXPERIMENT/METHOD/TIME/{RUN_FILES.config}{seen}"
@@ -165,18 +171,18 @@ def distinct(names: Iterable[str]) -> list[str]:
 
 
 def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
-    """The scene that the viewer and the exporters get: the first one held out of training, or else
-    the first."""
+    """The scene for the viewer and the exporters: the first evaluation scene, or else the first
+    scene."""
     held_out = set(eval_scenes)
     return next((name for name in names if name in held_out), names[0])
 
 
 def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Path]:
-    """Files at or below a path that hold a scene and whose names are ``wanted``, sorted.
+    """Scene files at or below a path whose names are ``wanted``, sorted.
 
-    Folders of runs, hidden folders and results of commands are not searched. A PLY may also hold
-    points or a mesh, so its header is read. Pipes, sockets and devices may have no end, and are not
-    opened.
+    Folders of runs, hidden folders and results of commands are not searched. The headers of PLY
+    files are read, because a PLY may hold points or a mesh. Pipes, sockets and devices are not
+    opened, because they may never end.
     """
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
@@ -189,29 +195,29 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
     scenes = []
     for path in sorted(paths):
         if why := _why_none(path):
-            logger.warning("passed over %s: %s", path, why)
+            logger.warning("skipped %s: %s", path, why)
         else:
             scenes.append(path)
     return scenes
 
 
 def _stem(path: Path) -> str:
-    """The path of a scene's file without the suffix of its format, such as ``.compressed.ply``."""
+    """Path of a scene file without its format suffix, such as ``.compressed.ply``."""
     kind = format_named(path.name)
     return path.as_posix()[: -len(path.suffix if kind is None else kind.suffix)]
 
 
 def _experiment_folder(run: Run) -> Path:
-    """The folder that all runs of an experiment share: EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP.
-    For a run that was moved out of that layout, its own folder."""
+    """Folder of all runs of an experiment: EXPERIMENT of EXPERIMENT/METHOD/TIMESTAMP, or the run's
+    own folder if it was moved out of that layout."""
     place = run.folder.resolve()
     as_laid_out = (place.parent.name, place.name) == (run.method_name, run.timestamp)
     return place.parents[1] if as_laid_out else place
 
 
 def _when(run: Run) -> tuple[float, int]:
-    """Sort key of a run's age: nerfstudio's timestamp, or the checkpoint's file time if the
-    timestamp was renamed."""
+    """Sort key of a run's age: nerfstudio's timestamp, or the checkpoint's file time if the folder
+    was renamed."""
     try:
         return datetime.strptime(run.timestamp, "%Y-%m-%d_%H%M%S").timestamp(), run.step
     except ValueError:
@@ -219,8 +225,8 @@ def _when(run: Run) -> tuple[float, int]:
 
 
 def _why_none(path: Path) -> str:
-    """Why a file holds no Gaussians: it is a PLY of points or of a mesh. Empty if it does, or if
-    its reader says it."""
+    """Why a file holds no Gaussians: it is a PLY of points or of a mesh. Empty if it holds some, or
+    if its reader reports the reason."""
     if not path.is_file():
         return "not a regular file"
     try:

@@ -1,4 +1,4 @@
-"""The one container of a 3D Gaussian scene.
+"""The container of a 3D Gaussian scene.
 
 Parameters are stored as in Splatfacto and the 3DGS PLY (natural-log scales, opacity logits,
 unnormalised wxyz quaternions, SH coefficients), so that reading and writing lose nothing. Activated
@@ -24,15 +24,14 @@ from pointsplat_ns.system.tensors import DOUBLES
 MAX_SH_DEGREE = 3
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-"""Names of the parameters of Gaussians, also in checkpoints and in Splatfacto's optimisers."""
+"""Names of the parameters, also in checkpoints and in Splatfacto's optimisers."""
 
 
 def sh_degree_of(num_rest: int) -> int:
-    """SH degree of a scene with ``num_rest`` coefficients of degree 1 and higher for each colour
-    channel.
+    """SH degree of a scene with ``num_rest`` coefficients of degree 1 and higher per channel.
 
     Raises:
-        SceneError: if no degree from 0 to 3 has this number.
+        SceneError: if no degree from 0 to 3 has this number of coefficients.
     """
     for degree in range(MAX_SH_DEGREE + 1):
         if (degree + 1) ** 2 - 1 == num_rest:
@@ -44,11 +43,11 @@ def sh_degree_of(num_rest: int) -> int:
 
 
 Offset = tuple[float, float, float]
-"""Where the origin of a scene lies in the frame of its file, scene units."""
+"""Origin of a scene in the frame of its file, scene units."""
 
 
 class Traits(NamedTuple):
-    """What files declare of a scene beside its Gaussians; see :class:`Gaussians`."""
+    """Properties that files declare of a scene beside its Gaussians; see :class:`Gaussians`."""
 
     antialiased: bool = False
     up: str | None = None
@@ -56,12 +55,12 @@ class Traits(NamedTuple):
 
 
 PLAIN = Traits()
-"""The traits of a scene of which nothing is declared."""
+"""Traits of a scene whose file declares none."""
 
 
 class _Activated(torch.autograd.Function):
-    """``exp`` or ``sigmoid`` of raw values; where the result or its slope is not finite, the
-    gradient is 0, not NaN: such a Gaussian is not drawn."""
+    """``exp`` or ``sigmoid`` of raw values. The gradient is 0, not NaN, where the result or its
+    slope is not finite, because such a Gaussian is not drawn."""
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
@@ -80,35 +79,32 @@ class _Activated(torch.autograd.Function):
 
 @dataclass(frozen=True, repr=False)
 class Gaussians:
-    """A scene of N Gaussians, on one device and of one floating dtype, in Splatfacto's own
-    parametrisation.
+    """A scene of N Gaussians, on one device and of one floating dtype, parametrised as Splatfacto.
 
     Attributes:
         means: (N, 3) positions, world, scene units.
         scales: (N, 3) natural logarithms of the standard deviations along the Gaussian's own axes,
-            which are in scene units; -Inf is a flat axis, and above 88.7 float32 cannot hold the
-            deviation.
+            in scene units; -Inf is a flat axis. Above 88.7, the deviation overflows float32.
         quats: (N, 4) rotations of those axes into the world, quaternions wxyz of any length; zero
             is the identity.
         opacities: (N, 1) logits; +Inf is opacity 1 and -Inf opacity 0.
         features_dc: (N, 3) constant SH coefficient of red, green and blue: colour = 0.5 +
             :data:`SH_C0` * features_dc.
         features_rest: (N, (d+1)^2 - 1, 3) the other coefficients of SH degree d, from 0 to 3.
-        antialiased: whether the scene was trained to be drawn antialiased (Mip-Splatting), and so
-            is.
+        antialiased: whether the scene was trained for antialiased rendering (Mip-Splatting), and is
+            drawn antialiased.
         up: the axis that is up, "x", "y", "z", "-x", "-y" or "-z", if the scene's file declares it;
             else None.
-        offset: where the origin of ``means`` lies in the frame of the scene's file and of its
-            poses, scene units, as that of a geo-referenced scene; None for (0, 0, 0).
+        offset: origin of ``means`` in the frame of the scene's file and of its poses, scene units,
+            for example of a geo-referenced scene; None for (0, 0, 0).
 
     Raises:
-        SceneError: if a parameter is no tensor, a shape, device or dtype does not fit the others,
-            no SH degree has this number of coefficients, ``up`` is no axis, or ``offset`` is not
-            three finite numbers.
+        SceneError: if a parameter is not a tensor, its shape, device or dtype does not match the
+            others, no SH degree has this number of coefficients, ``up`` is not an axis, or
+            ``offset`` is not three finite numbers.
 
     Example:
-        Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside
-        it.
+        Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, beside a red disc.
 
         >>> import torch
         >>> import pointsplat_ns as ps
@@ -123,7 +119,7 @@ class Gaussians:
         ... )
         >>> len(scene), scene.sh_degree, scene.alphas.tolist()[1]
         (2, 0, 0.5)
-        >>> disc = scene[1]  # or a slice, a mask or a tensor of indices; always a scene
+        >>> disc = scene[1]  # a slice, mask or index tensor also gives a scene
         >>> disc.means.tolist()
         [[1.0, 0.0, 0.0]]
     """
@@ -150,7 +146,7 @@ class Gaussians:
             if not isinstance(value, Tensor):
                 raise SceneError(
                     f"{name} is a {type(value).__module__}.{type(value).__qualname__}; expected a "
-                    "torch.Tensor; torch.as_tensor makes one"
+                    "torch.Tensor; convert it with torch.as_tensor"
                 )
         n = self.means.shape[0] if self.means.dim() else -1
         for name, tail in tails.items():
@@ -186,8 +182,8 @@ class Gaussians:
 
     @classmethod
     def cat(cls, scenes: Sequence[Gaussians]) -> Gaussians:
-        """All Gaussians of several scenes of one SH degree, in order; antialiased if one of the
-        scenes is, with the up axis and the offset of the first."""
+        """All Gaussians of several scenes of one SH degree, in order; antialiased if any of the
+        scenes is; up axis and offset of the first."""
         first = scenes[0]
         parts = zip(*(scene.at_offset(first.offset).tensors() for scene in scenes), strict=True)
         traits = first.traits._replace(antialiased=any(scene.antialiased for scene in scenes))
@@ -202,7 +198,7 @@ class Gaussians:
         return [value for _, value in self.items()]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """A scene whose every parameter is ``function(parameter)``."""
+        """A scene with ``function`` applied to every parameter."""
         return Gaussians(*map(function, self.tensors()), **self.traits._asdict())
 
     def replace(self, **changes: Any) -> Gaussians:
@@ -210,8 +206,7 @@ class Gaussians:
         return dataclasses.replace(self, **changes)
 
     def at_offset(self, offset: Offset | None) -> Gaussians:
-        """The same scene with its positions about another point of its file's frame, moved in
-        float64."""
+        """The same scene with positions relative to another offset, converted in float64."""
         old = self.offset or (0.0, 0.0, 0.0)
         new = offset or (0.0, 0.0, 0.0)
         declared = new if any(new) else None
@@ -249,17 +244,17 @@ class Gaussians:
 
     @property
     def traits(self) -> Traits:
-        """What a file declares of the scene beside its Gaussians."""
+        """The properties that a file declares of the scene beside its Gaussians."""
         return Traits(self.antialiased, self.up, self.offset)
 
     @property
     def device(self) -> torch.device:
-        """Device of all parameters."""
+        """Device of the parameters."""
         return self.means.device
 
     @property
     def dtype(self) -> torch.dtype:
-        """The floating type of all parameters."""
+        """Floating type of the parameters."""
         return self.means.dtype
 
     @property
@@ -274,34 +269,34 @@ class Gaussians:
 
     @property
     def alphas(self) -> Tensor:
-        """Opacities in [0, 1], (N,). The gradient of one that is NaN is 0."""
+        """Opacities in [0, 1], (N,). The gradient of a NaN is 0."""
         return _Activated.apply(self.opacities[:, 0], torch.sigmoid)
 
     @property
     def stds(self) -> Tensor:
-        """Standard deviations along the Gaussian's own axes, scene units, (N, 3). The gradient of
-        one that is NaN or infinite is 0."""
+        """Standard deviations along the Gaussian's own axes, scene units, (N, 3). The gradient of a
+        NaN or Inf is 0."""
         return _Activated.apply(self.scales, torch.exp)
 
     @property
     def megabytes(self) -> float:
-        """Size of the parameters as float32, in units of 10^6 bytes."""
+        """Size of the parameters as float32, in MB (10^6 bytes)."""
         return 4e-6 * sum(value.numel() for value in self.tensors())
 
     def usable(self) -> Tensor:
         """Mask (N,) of drawable Gaussians: no value is NaN or infinite, except opacity logits
-        (+-Inf are opacity 1 and 0) and log-scales of -Inf (a flat axis), and no standard deviation
-        is infinite in the scene's dtype: log-scales are at most 88.7 in float32 and bfloat16, 709
-        in float64 and 11 in float16."""
+        (+-Inf are opacity 1 and 0) and log-scales of -Inf (a flat axis), and standard deviations
+        are finite in the scene's dtype: log-scales are at most 88.7 in float32 and bfloat16, 709 in
+        float64 and 11 in float16."""
         ok = torch.ones(len(self), dtype=torch.bool, device=self.device)
         for name, value in self.items() if len(self) else ():
             flat = value.reshape(len(self), -1)
             if name == "opacities":
                 bad = flat.isnan()
             elif name == "scales":
-                bad = ~(flat.detach().exp() < torch.inf)  # of NaN, too
+                bad = ~(flat.detach().exp() < torch.inf)  # True for NaN too
             elif bool(flat.sum().isfinite()):
-                # a finite sum has only finite terms; thirty times faster than a test of each
+                # a finite sum has only finite terms; thirty times faster than isfinite per value
                 continue
             else:
                 bad = ~flat.isfinite()

@@ -1,4 +1,4 @@
-"""Images as files and as numbers."""
+"""Reads and writes image files."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "PPM")
-"""Pillow's names of the formats that are decoded. Pillow decides by content, and hands PostScript
-to another program."""
+"""Pillow's names of the supported formats. Pillow decides by content; without this list it would
+pass PostScript to another program."""
 
 MOST_PIXELS = 150_000_000
-"""Largest image that is decoded: 450 MB as bytes of RGB."""
+"""Maximum pixels of an image: 450 MB as RGB bytes."""
 
 IMAGE_ERRORS = (
     OSError,
@@ -38,16 +38,16 @@ IMAGE_ERRORS = (
     RuntimeError,
     struct.error,
 )
-"""What Pillow raises for a damaged image."""
+"""Exceptions that Pillow raises for damaged images."""
 
 
 @contextmanager
 def open_image(path: Path | str) -> Iterator[Image]:
-    """A JPEG, PNG, WebP, BMP, TIFF or PPM file as Pillow's image, of which the header is read. Its
-    pixels can be decoded until the context ends.
+    """Open a JPEG, PNG, WebP, BMP, TIFF or PPM file as a Pillow image with its header read. Pixels
+    can be decoded inside of the context.
 
     Raises:
-        OSError: if the file is missing, not a regular one, or none of these.
+        OSError: if the file is missing, not a regular file, or has another format.
         ValueError: if it has more than :data:`MOST_PIXELS`.
     """
     from PIL import Image
@@ -55,9 +55,9 @@ def open_image(path: Path | str) -> Iterator[Image]:
     with open_regular(path) as stream:
         start = stream.read(30)
         stream.seek(0)
-        if start[:4] == b"RIFF":  # Pillow takes the memory of its pixels when it opens a WebP
+        if start[:4] == b"RIFF":  # Pillow allocates the pixels of a WebP when it opens it
             _need_decodable(*webp_size(start))
-        with warnings.catch_warnings():  # of sizes below our limit
+        with warnings.catch_warnings():  # about sizes below our limit
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             try:
                 image = Image.open(stream, formats=IMAGE_FORMATS)
@@ -80,33 +80,32 @@ def _too_large(found: str) -> str:
 
 
 def in_unit_range(image: Tensor) -> Tensor:
-    """An image of any shape in [0, 1]: bytes count in 255ths, floats stay."""
+    """An image of any shape in [0, 1]: bytes are divided by 255, floats are unchanged."""
     return image.float() / 255 if image.dtype == torch.uint8 else image
 
 
 def exif_hint(path: Path, wanted: tuple[int, int]) -> str:
-    """What to do with a photo of another size than its camera's, as the end of an error: about its
-    EXIF orientation, if that turns it to the shape that is wanted (width and height, pixels); else
-    empty. Photos are read as they are stored, which is how COLMAP reads them, too."""
+    """End of the error message for a photo of another size than its camera's (``wanted``: width and
+    height, pixels): advice on its EXIF orientation if that would give the camera's shape, else
+    empty. EXIF orientations are ignored, as in COLMAP."""
     try:
         with open_image(path) as photo:
             size = photo.size
             orientation = photo.getexif().get(274)
     except IMAGE_ERRORS:
         return ""
-    upright = (size[0] - size[1]) * (wanted[0] - wanted[1]) > 0  # or scaled
-    if orientation not in (5, 6, 7, 8) or upright:  # those exchange width and height
+    upright = (size[0] - size[1]) * (wanted[0] - wanted[1]) > 0  # possibly scaled
+    if orientation not in (5, 6, 7, 8) or upright:  # these swap width and height
         return ""
     return (
-        f"; its EXIF orientation ({orientation}) says that it is to be turned, and the camera is "
-        "that of the turned "
-        "photo: turn the photos themselves, for example with mogrify -auto-orient *.jpg"
+        f"; its EXIF orientation ({orientation}) rotates it, and the camera belongs to the rotated "
+        "photo: rotate the photos themselves, for example with mogrify -auto-orient *.jpg"
     )
 
 
 def webp_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a WebP image in pixels, as its header says (RFC 9649); a ValueError if it
-    is none."""
+    """Width and height of a WebP image in pixels, from its header (RFC 9649); a ValueError if it is
+    not WebP."""
     kind = data[12:16]
     head = data[20:30]
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(head) == 10:
@@ -123,13 +122,13 @@ def webp_size(data: bytes) -> tuple[int, int]:
 
 
 def read_reduced(path: Path, side: int) -> Tensor | None:
-    """An image file, reduced until its longer side is about ``side`` pixels: (H, W, 3) float32 in
-    [0, 1], transparency over black; None if it cannot be read."""
+    """An image file reduced to a longer side of about ``side`` pixels: (H, W, 3) float32 in [0, 1],
+    transparency over black; None if it cannot be read."""
     from PIL import Image
 
     try:
         with open_image(path) as opened:
-            opened.draft("RGB", (side, side))  # JPEGs are decoded at an eighth of their size
+            opened.draft("RGB", (side, side))  # decodes JPEGs at down to an eighth of their size
             opened.thumbnail((side, side), Image.Resampling.BOX)
             image = torch.from_numpy(np.asarray(opened.convert("RGBA"), dtype=np.float32) / 255)
     except IMAGE_ERRORS:
@@ -138,9 +137,9 @@ def read_reduced(path: Path, side: int) -> Tensor | None:
 
 
 def write_picture(picture: Tensor, path: Path, named: bool = True) -> None:
-    """Write an image (H, W, 3), clamped to [0, 1], as a PNG; as a JPEG if the path ends in
-    ``.jpg``; ``named`` as of :func:`~pointsplat_ns.system.files.replacing`. Raises SceneError if it
-    cannot be written."""
+    """Write an image (H, W, 3), clamped to [0, 1], as a PNG, or as a JPEG if the path ends in
+    ``.jpg``. ``named`` is as for :func:`~pointsplat_ns.system.files.replacing`. Raises SceneError
+    if the file cannot be written."""
     from PIL import Image
 
     image = Image.fromarray((255 * picture.clamp(0, 1)).round().to(torch.uint8).cpu().numpy())

@@ -2,7 +2,7 @@
 
 nerfstudio saves its configuration as YAML with Python objects. The usual loader imports and calls
 whatever the file names. Here a tag such as ``!!python/object:pkg.Class`` becomes a :class:`Tagged`
-value, paths become :class:`pathlib.Path` and tuples become tuples. Nothing is imported or called.
+value, paths become :class:`pathlib.Path` and tuples become tuples; no code is imported or called.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pointsplat_ns.system.files import one_line, require_file
 
 @dataclass(frozen=True)
 class Tagged:
-    """A Python object in the file, which is not built."""
+    """A Python object in the file; it is not constructed."""
 
     tag: str
     """Dotted name of its class or function."""
@@ -28,12 +28,12 @@ class Tagged:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The value if it is a dictionary of fields, else an empty one."""
+        """The value if it is a dictionary of fields, else an empty dictionary."""
         return self.value if isinstance(self.value, dict) else {}
 
 
 class _Loader(yaml.SafeLoader):
-    """``SafeLoader`` that also accepts YAML's Python tags, as :class:`Tagged` values."""
+    """``SafeLoader`` that accepts YAML's Python tags as :class:`Tagged` values."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Refuse merge keys: nested ones grow exponentially, and nerfstudio writes none."""
@@ -46,16 +46,17 @@ class _Loader(yaml.SafeLoader):
 def read_config(path: Path | str) -> Tagged:
     """Read a ``config.yml``.
 
-    Aliases share one value, so they cannot fill the memory.
+    Aliases share one value, so they cannot exhaust memory.
 
     Returns:
         The configuration object at the root of the file.
 
     Raises:
-        SceneError: if it is not YAML, too big, too deep, or has no Python object at its root.
+        SceneError: if the file is not YAML, is too large or too deeply nested, or has no Python
+            object at its root.
     """
     path = require_file(path, "nerfstudio's config.yml")
-    # one has about 10 kB
+    # nerfstudio writes about 10 kB
     size = path.stat().st_size
     most = 1 << 18
     if size > most:
@@ -86,15 +87,15 @@ def read_config(path: Path | str) -> Tagged:
 
 
 def _count(node: yaml.Node, known: dict[int, int], most: int = 1 << 16) -> int:
-    """The number of values that a node stands for, those that aliases repeat counted each time; a
-    ValueError if there are more than ``most``, or the node holds itself. nerfstudio's file has some
-    hundreds. As text or as a key, a value is as long as all that it holds.
+    """Number of values below a node, with the values of an alias counted at every use; a ValueError
+    if there are more than ``most``, or the node contains itself. The text of a value, and its hash
+    as a key, take time in proportion to this number. nerfstudio's file has some hundreds.
 
-    ``known`` has the numbers by the identity of nodes; 0 marks those that are being counted.
+    ``known`` maps node identities to numbers; 0 marks nodes that are being counted.
     """
     if id(node) in known:
         if not known[id(node)]:
-            raise ValueError("a recursive value: it holds itself")
+            raise ValueError("a recursive value: it contains itself")
         return known[id(node)]
     known[id(node)] = 0
     parts = node.value if isinstance(node, yaml.CollectionNode) else ()

@@ -1,5 +1,4 @@
-"""Scenes far from their origin, such as geo-referenced ones: the offset that leaves float32 its
-digits."""
+"""Offsets of scenes far from their origin, such as geo-referenced ones, to preserve precision."""
 
 from __future__ import annotations
 
@@ -15,11 +14,12 @@ from pointsplat_ns.system.files import logger
 from pointsplat_ns.system.tensors import DOUBLES
 
 SAMPLED = 4096
-"""Gaussians that tell the distance and the size of a scene, at most."""
+"""Maximum number of Gaussians sampled to estimate the distance and size of a scene."""
 
 
 def offset_for(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> Offset | None:
-    """The offset of a scene whose positions float32 would round too far; None if it holds them.
+    """The offset for a scene whose positions lose too much precision in float32; None if they do
+    not.
 
     It is the median position, rounded to a power of ten within the extent of the scene.
 
@@ -34,8 +34,8 @@ def offset_for(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> 
 
 
 def rounded_centre(means: NDArray[np.float64]) -> Offset:
-    """The median position (3,) of finite positions (N, 3), N > 0, rounded to a power of ten within
-    their extent."""
+    """The median of finite positions (N, 3), N > 0, rounded to a power of ten within their
+    extent."""
     centre = np.median(means, axis=0)
     extent = float(np.median(np.abs(means - centre).max(axis=1)))
     unit = 10.0 ** math.floor(math.log10(extent)) if extent > 1e-300 else 0.0
@@ -44,8 +44,8 @@ def rounded_centre(means: NDArray[np.float64]) -> Offset:
 
 
 def warn_if_far(scene: Gaussians, path: Path | str) -> None:
-    """Log that a scene's positions have lost digits, if steps of float32 are large beside the sizes
-    of Gaussians."""
+    """Log a warning if a scene's positions have lost precision: float32 steps are large compared to
+    the sizes of Gaussians."""
     some = scene[:: max(1, len(scene) // SAMPLED)]
     if not len(some):
         return
@@ -53,9 +53,9 @@ def warn_if_far(scene: Gaussians, path: Path | str) -> None:
     times = _steps_a_size(means, some.scales.detach().double().cpu().numpy())
     if times > 1 / 4:
         logger.warning(
-            "%s: lies %.3g units from its origin, where float32 has steps of %.2g times the "
-            "median size of a Gaussian: positions have lost their digits; export it with x, y and "
-            "z as doubles, or nearer to the origin",
+            "%s: lies %.3g units from its origin, where float32 steps are %.2g times the median "
+            "size of a Gaussian: positions have lost precision; export it with x, y and z as "
+            "doubles, or nearer to the origin",
             path,
             np.abs(np.median(means, axis=0)).max(),
             times,
@@ -63,12 +63,12 @@ def warn_if_far(scene: Gaussians, path: Path | str) -> None:
 
 
 def offset_text(offset: Offset) -> str:
-    """An offset as text, such as ``451000.0 5411000.0 300.0``, which is read back to the bit."""
+    """An offset as text, such as ``451000.0 5411000.0 300.0``, exact to the bit."""
     return " ".join(repr(value) for value in offset)
 
 
 def offset_of_text(text: str) -> Offset | None:
-    """The offset in what :func:`offset_text` returns; None if it is no such text."""
+    """The offset in a text of :func:`offset_text`; None for any other text."""
     try:
         x, y, z = (float(word) for word in text.split())
     except ValueError:
@@ -78,8 +78,7 @@ def offset_of_text(text: str) -> Offset | None:
 
 
 def from_centre(scene: Gaussians) -> Gaussians:
-    """A scene about its middle: with the offset of :func:`rounded_centre`, in the frame of its
-    file."""
+    """A scene with the offset :func:`rounded_centre`, in the frame of its file."""
     usable = scene.means[scene.usable()].double().cpu()
     if not len(usable):
         return scene
@@ -89,7 +88,7 @@ def from_centre(scene: Gaussians) -> Gaussians:
 
 
 def _steps_a_size(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> float:
-    """Steps of float32 at the median position, in median sizes of the Gaussians."""
+    """Float32 step at the median position, relative to the median size of the Gaussians."""
     step = float(np.abs(np.median(means, axis=0)).max()) * 2.0**-23
     size = math.exp(min(max(float(np.median(np.median(log_scales, axis=1))), -300.0), 300.0))
     return step / size

@@ -1,5 +1,4 @@
-"""Photos in a folder: which belong to the cameras of a file, and their pixels as pinholes see
-them."""
+"""Photos in a folder: matches them to cameras, and undistorts them to pinhole images."""
 
 from __future__ import annotations
 
@@ -26,9 +25,8 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 
 
 def photo_files(folder: Path) -> list[str]:
-    """Paths of the photos in a folder or below, relative to it with ``/`` between folders, sorted;
-    hidden ones are not among them. Raises DataError if there are none, or too many, or there is no
-    such folder."""
+    """Paths of the photos in or below a folder, relative to it with ``/`` as separator, sorted;
+    without hidden files. Raises DataError if the folder is missing, or has no photo or too many."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; expected the folder of the photos")
     found: list[str] = []
@@ -49,11 +47,11 @@ def photo_files(folder: Path) -> list[str]:
 
 
 def photos_of_cameras(folder: Path, files: Sequence[str], named: NamedViews) -> dict[int, Path]:
-    """The photo of each view that has one, by the index of the view.
+    """The photo of each view by view index; views without a photo are omitted.
 
-    A photo lies in the folder under the name that the model has; else where the model's own folder
-    has it; else it is the only one whose path ends like the name, suffixes apart. A photo that two
-    views would have is nobody's.
+    A photo is matched by the name in the camera file: in the folder, else in the model's own
+    folders, else as the only photo whose path ends in that name, suffixes ignored. A photo that
+    matches two views is not used.
     """
     root = folder.absolute()
     known = set(files)
@@ -82,32 +80,31 @@ def photos_of_cameras(folder: Path, files: Sequence[str], named: NamedViews) -> 
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    """The folders and the name of a photo, without a suffix of photos."""
+    """Folders and name of a photo, without its photo suffix."""
     path = PurePosixPath(name)
     return path.with_suffix("").parts if path.suffix.lower() in PHOTO_SUFFIXES else path.parts
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo as a pinhole sees it."""
+    """An undistorted photo: a pinhole image."""
 
     image: Tensor  # [H, W, 3] uint8, transparent parts over black
-    mask: Tensor | None  # [H, W, 1] bool, the pixels that count; None for all
+    mask: Tensor | None  # [H, W, 1] bool, True for valid pixels; None if all are valid
     K: Tensor  # [3, 3] float64 intrinsics, pixels
 
 
 class PhotoReader:
-    """Reads photos of cameras: reduced while decoding, undistorted, and with the mask that the file
-    of cameras names.
+    """Reads photos of cameras: decoded at reduced size, undistorted, and with their masks.
 
-    The pinhole has the focal lengths and the principal point of the camera. Pixels that the lens
-    does not show do not count. What is computed for a lens is kept: a capture has few.
+    The pinhole has the focal lengths and the principal point of the camera. Pixels outside of the
+    lens image are invalid. Undistortion maps are cached per lens, because a capture has few lenses.
 
     Args:
-        masks: the folder in which, or below which, the masks lie that cameras name.
-        side: longer side of the pictures, pixels; smaller photos stay as they are.
-        folder: of the photos. Where cameras name no mask, that of ``a.jpg`` is ``a.jpg.png``, as
-            COLMAP names it, or ``a.png`` in the folder ``masks`` beside it.
+        masks: folder that contains, directly or below, the masks that cameras name.
+        side: longer side of the images, pixels; smaller photos are not enlarged.
+        folder: of the photos. If cameras name no mask, the mask of ``a.jpg`` is ``a.jpg.png``, as
+            in COLMAP, or ``a.png``, in the folder ``masks`` beside ``folder``.
     """
 
     def __init__(self, masks: Path, side: int, folder: Path | None = None):
@@ -117,21 +114,20 @@ class PhotoReader:
         self._maps: dict[tuple, tuple[Tensor, Tensor]] = {}
 
     def size(self, path: Path, camera: Camera) -> tuple[int, int]:
-        """Width and height, pixels, that a photo will have. Its pixels are not decoded. Errors are
+        """Width and height, pixels, of the photo after reading. Does not decode pixels. Errors are
         those of :meth:`read`."""
         return self._opened(path, camera)[0]
 
     def read(self, path: Path, camera: Camera) -> Photo:
-        """The photo of a camera. Raises DataError if it cannot be read, is huge or of another shape
-        than the camera, or its lens cannot be undone."""
+        """The photo of a camera. Raises DataError if it cannot be read, is too large, has another
+        aspect ratio than the camera, or its lens cannot be undistorted."""
         from PIL import Image, ImageOps
 
         size, turned = self._opened(path, camera)
         try:
             with open_image(path) as opened:
-                opened.draft(
-                    "RGB", size[::-1] if turned else size
-                )  # JPEGs are decoded at a half or less
+                # JPEGs are decoded at a half or less
+                opened.draft("RGB", size[::-1] if turned else size)
                 kind = (
                     "RGBA"
                     if opened.mode in ("RGBA", "LA", "PA") or "transparency" in opened.info
@@ -155,7 +151,7 @@ class PhotoReader:
         except ValueError as error:
             raise DataError(
                 f"{path}: its camera has {error}; undistort the photos (colmap image_undistorter) "
-                "and take the model that this writes"
+                "and use the model that this writes"
             ) from error
         if lens is None:
             return Photo(image, mask, K)
@@ -165,8 +161,8 @@ class PhotoReader:
         return Photo(image, shown, K)
 
     def _opened(self, path: Path, camera: Camera) -> tuple[tuple[int, int], bool]:
-        """The size that a photo will have, and whether its EXIF orientation is followed, which is
-        so where the camera is that of the turned photo."""
+        """Size of the photo, and whether to apply its EXIF orientation, which is the case if the
+        camera belongs to the rotated photo."""
         try:
             with open_image(path) as opened:
                 size = opened.size
@@ -182,7 +178,7 @@ class PhotoReader:
         width, height = size[::-1] if turned else size
         if abs(width * camera.size[1] / (height * camera.size[0]) - 1) > 0.02:
             raise DataError(
-                f"{path}: {width} x {height} pixels, but its camera says {camera.size[0]:.0f} x "
+                f"{path}: {width} x {height} pixels, but its camera is for {camera.size[0]:.0f} x "
                 f"{camera.size[1]:.0f}; expected that shape: the photos that the poses were "
                 "computed from, or smaller copies"
             )
@@ -190,17 +186,16 @@ class PhotoReader:
         return (max(1, round(width * factor)), max(1, round(height * factor))), turned
 
     def mask_of(self, path: Path, camera: Camera) -> Path | None:
-        """The file of the mask of a photo; None if all its pixels count. Raises DataError if the
-        mask that its camera names is not there."""
+        """File of the mask of a photo; None if all its pixels are valid. Raises DataError if the
+        mask that its camera names is missing."""
         relative = PurePosixPath(camera.mask if "\0" not in camera.mask else "")
         if relative.name:
             mask = self._masks / relative
-            if (
-                relative.is_absolute() or ".." in relative.parts or not mask.is_file()
-            ):  # nothing outside is opened
+            # never opens files outside of the folder
+            if relative.is_absolute() or ".." in relative.parts or not mask.is_file():
                 raise DataError(
-                    f"{mask}: no such mask, but the cameras name it; put it there, or take its "
-                    "name away"
+                    f"{mask}: no such mask, but the cameras name it; add the file, or remove its "
+                    "name from the camera file"
                 )
             return mask
         if self._folder is None:
@@ -210,7 +205,7 @@ class PhotoReader:
         return next((name for name in names if name.is_file()), None)
 
     def _mask(self, photo: Path, camera: Camera, size: tuple[int, int]) -> Tensor | None:
-        """The mask of a photo, (H, W, 1) bool. White pixels count."""
+        """The mask of a photo, (H, W, 1) bool. White pixels are valid."""
         from PIL import Image
 
         path = self.mask_of(photo, camera)
@@ -231,17 +226,17 @@ class PhotoReader:
             places, shown = pixel_map(lens, K, *size)
             if float(shown.double().mean()) < 0.1:
                 raise DataError(
-                    f"{path}: the lens distortion of its camera leaves nothing of the photo; "
-                    "check its coefficients"
+                    f"{path}: undistorting it with its camera's lens leaves no pixels; check the "
+                    "distortion coefficients"
                 )
-            if len(self._maps) >= 8:  # of a lens for each photo none is needed twice
+            if len(self._maps) >= 8:  # if each photo has its own lens, none is reused
                 self._maps.pop(next(iter(self._maps)))
             self._maps[key] = places, shown[..., None]
         return self._maps[key]
 
 
 def _sampled(image: Tensor, places: Tensor) -> Tensor:
-    """An image (H, W, C) at places (h, w, 2), bilinear: (h, w, C) float32."""
+    """An image (H, W, C) sampled at places (h, w, 2), bilinear: (h, w, C) float32."""
     planes = image.permute(2, 0, 1)[None].float()
     return F.grid_sample(planes, places[None], padding_mode="border", align_corners=False)[
         0

@@ -1,8 +1,8 @@
-"""3DGS PLY files: the format that viewers of Gaussian scenes exchange.
+"""3DGS PLY files: the exchange format of Gaussian splat viewers.
 
 One ``vertex`` per Gaussian with the properties ``x y z nx ny nz f_dc_0..2 f_rest_0..(3K-1) opacity
 scale_0..2 rot_0..3``, in Splatfacto's own parametrisation. ``f_rest`` is channel-major: all K
-coefficients of red, then green, then blue. Normals are not used; they are written as zeros.
+coefficients of red, then green, then blue. Normals are ignored and written as zeros.
 """
 
 from __future__ import annotations
@@ -46,16 +46,15 @@ COLUMNS = {
     "scales": ["scale_0", "scale_1", "scale_2"],
     "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
 }
-"""Vertex properties of the attributes; normals are written as zeros and not read."""
+"""Vertex properties of each attribute; normals are ignored and written as zeros."""
 
 
 def read_ply(path: Path | str) -> Gaussians:
-    """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any
-    type.
+    """Read a 3DGS PLY: binary of either byte order, or ASCII; properties of any type in any order.
 
     The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3
-    are read. 2D Gaussians, which have no ``scale_2``, become flat ones. CloudCompare's prefixes of
-    names are understood. Other properties and elements are not read; a warning says so.
+    are read. 2D Gaussians, which have no ``scale_2``, become flat ones. CloudCompare's name
+    prefixes are removed. Other properties and elements are ignored with a warning.
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
@@ -66,12 +65,11 @@ def read_ply(path: Path | str) -> Gaussians:
 
 
 class PlyRows:
-    """The Gaussians of a 3DGS PLY; of a binary one, they are read in pieces, and the whole need not
-    fit into memory.
+    """The Gaussians of a 3DGS PLY. A binary file is read in pieces and need not fit into memory.
 
     Args:
         path: the file.
-        warn: whether what is not read, and the offset of positions, are logged.
+        warn: whether to log ignored properties and the offset of positions.
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
@@ -79,11 +77,11 @@ class PlyRows:
 
     path: Path
     count: int
-    """Number of Gaussians in the file, those that cannot be drawn included."""
+    """Number of Gaussians in the file, including those that cannot be drawn."""
     rest: int
-    """Number of SH coefficients per channel beyond the constant one that are read."""
+    """Number of SH coefficients per channel beyond the constant one, as read."""
     traits: Traits
-    """What the file declares beside the Gaussians."""
+    """Properties that the file declares of the scene beside its Gaussians."""
 
     def __init__(self, path: Path | str, warn: bool = True):
         self.path = path = require_file(path, "a 3DGS PLY file")
@@ -111,8 +109,8 @@ class PlyRows:
 
     @classmethod
     def open(cls, path: Path | str, warn: bool = True) -> PlyRows | None:
-        """The rows of a file, which may ``warn``; None for an ASCII file, which has no rows of one
-        length."""
+        """The rows of a file; None for an ASCII file, whose rows have different lengths. ``warn``
+        is as for the class."""
         rows = cls(path, warn)
         return rows if rows._header.order else None
 
@@ -125,15 +123,15 @@ class PlyRows:
         return sh_degree_of(self.rest)
 
     def read(self, start: int, stop: int) -> Gaussians:
-        """The Gaussians of rows ``start`` to ``stop`` - 1, float32, those that cannot be drawn
-        included. Raises SceneError if the file cannot be read or has become shorter."""
+        """The Gaussians of rows ``start`` to ``stop`` - 1, float32, including those that cannot be
+        drawn. Raises SceneError if the file cannot be read or was truncated meanwhile."""
         return self.pick(range(start, stop))
 
     def pick(self, rows: Sequence[int]) -> Gaussians:
-        """The Gaussians of single rows, as :meth:`read` gives them."""
+        """The Gaussians of individual rows, as :meth:`read` returns them."""
         from numpy.lib.recfunctions import structured_to_unstructured
 
-        # Channel-major in the file, channel last in a scene.
+        # Channel-major in the file, channel-last in a scene.
         rest = [
             f"f_rest_{channel * self._in_file + i}"
             for i in range(self.rest)
@@ -147,9 +145,9 @@ class PlyRows:
             name: np.full((len(rows), len(fields)), -np.inf, np.float32)
             for name, fields in columns.items()
         }
-        columns["scales"] = self._scales  # of 2D Gaussians the last stays -Inf: a flat axis
+        columns["scales"] = self._scales  # for 2D Gaussians the last stays -Inf: a flat axis
         at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
-        # A double beyond float32 becomes Inf and is dropped with the others.
+        # A double beyond float32 becomes Inf; its Gaussian is dropped like others with Inf.
         with (
             np.errstate(over="ignore"),
             failure_named(self.path, "read"),
@@ -171,7 +169,7 @@ class PlyRows:
         return Gaussians(**tensors, antialiased=antialiased, up=up, offset=offset)
 
     def _rows(self, stream: io.BufferedReader, numbers: Sequence[int]) -> np.ndarray:
-        """Rows of these numbers. Raises SceneError if the file has become shorter."""
+        """Rows by index. Raises SceneError if the file was truncated meanwhile."""
         together = isinstance(numbers, range) and numbers.step == 1
         parts = [(numbers[0], len(numbers))] if together else [(number, 1) for number in numbers]
         if not self._header.order:
@@ -190,8 +188,8 @@ class PlyRows:
     @functools.cached_property
     def _parsed(self) -> np.ndarray:
         """The rows of an ASCII file. plyfile gets a checked header that ends with the Gaussians, so
-        comments in other encodings and elements after the Gaussians cannot cause errors. Raises
-        SceneError if they are damaged."""
+        comments in other encodings and later elements cannot cause errors. Raises SceneError if the
+        rows are damaged."""
         from plyfile import PlyData, PlyParseError
 
         require_memory(self.path, 2 * self.path.stat().st_size)
@@ -206,7 +204,7 @@ class PlyRows:
             ) from error
 
     def _shift_positions(self, warn: bool) -> None:
-        """Subtract an offset from positions that float32 would round too far, which is logged if
+        """Subtract an offset from positions that lose too much precision in float32; logged if
         ``warn``."""
         with failure_named(self.path, "read"), self.path.open("rb") as stream:
             rows = self._rows(stream, [*range(0, self.count, max(1, self.count // SAMPLED))])
@@ -220,7 +218,7 @@ class PlyRows:
             if warn:
                 text = offset_text((x, y, z))
                 logger.info(
-                    "%s: positions are doubles; their offset %s is kept beside the scene",
+                    "%s: positions are doubles; their offset %s is stored with the scene",
                     self.path,
                     text,
                 )
@@ -231,8 +229,7 @@ def _doubles(rows: np.ndarray, names: Sequence[str]) -> np.ndarray:
 
 
 def _gaussian_element(header: Header, path: Path) -> Element:
-    """The element that holds the Gaussians, its declared count checked against the bytes in the
-    file."""
+    """The element that holds the Gaussians, with its count checked against the file size."""
     elements = {element.name: element for element in header.elements}
     vertex = elements.get("vertex")
     if vertex is None:
@@ -264,7 +261,7 @@ def _gaussian_element(header: Header, path: Path) -> Element:
 
 
 def _report_unread(header: Header, vertex: Element, higher: bool, path: Path) -> None:
-    """Warn of what a file holds beside the Gaussians that are read."""
+    """Log a warning about content of a file that is not read."""
     if higher:
         logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
     known = {name for names in COLUMNS.values() for name in names}
@@ -288,16 +285,16 @@ def _report_unread(header: Header, vertex: Element, higher: bool, path: Path) ->
 
 
 def _least_bytes(element: Element, header: Header) -> int:
-    """Least number of bytes of an element: exact in binary; one digit and one separator per number
-    in ASCII."""
+    """Minimum number of bytes of an element: exact for binary; a digit and a separator per number
+    for ASCII."""
     if header.order:
         return element.count * element.row_bytes
-    # The last line of a file needs no newline.
+    # The newline of the last line is optional.
     return max(element.count * 2 * len(element.properties) - 1, 0)
 
 
 def _num_rest(vertex: Element, path: Path) -> int:
-    """Number of SH coefficients per channel beyond the constant one; checks that all properties are
+    """Number of SH coefficients per channel beyond the constant one. Checks that all properties are
     present."""
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
@@ -306,7 +303,7 @@ def _num_rest(vertex: Element, path: Path) -> int:
         )
     if "filter_3D" in present:
         raise SceneError(
-            f"{path}: Mip-Splatting's 3D filter lies beside the sizes (property 'filter_3D'); "
+            f"{path}: Mip-Splatting's 3D filter is not fused into scales (property 'filter_3D'); "
             "expected both fused, as its create_fused_ply.py writes them"
         )
     if "scale_2" not in present and {"scale_0", "scale_1", "opacity"} <= present:
@@ -338,8 +335,8 @@ def _num_rest(vertex: Element, path: Path) -> int:
 def write_ply(scene: Gaussians, path: Path | str) -> None:
     """Write ``scene`` as a 3DGS PLY: binary little endian, float32, the reference's property order.
 
-    :func:`read_ply` reads a float32 scene back unchanged to the bit. Gaussians that cannot be drawn
-    (NaN, or Inf where it is not valid) are left out, and their number is logged. The write is
+    :func:`read_ply` reads a float32 scene back exact to the bit. Gaussians that cannot be drawn
+    (NaN, or Inf where it is not valid) are dropped, and their number is logged. The write is
     atomic.
 
     Raises:
@@ -354,7 +351,7 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
 
 
 def row_table(scene: Gaussians) -> np.ndarray:
-    """The rows of a 3DGS PLY, (N, 17 + 3 K) little-endian float32, of a float32 scene on the
+    """The rows of a 3DGS PLY, (N, 17 + 3 K) little-endian float32, for a float32 scene on the
     CPU."""
     rest = scene.features_rest.transpose(1, 2).reshape(len(scene), 3 * scene.features_rest.shape[1])
     values = [scene.means, torch.zeros_like(scene.means), scene.features_dc, rest]
@@ -363,7 +360,7 @@ def row_table(scene: Gaussians) -> np.ndarray:
 
 
 def header_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> bytes:
-    """The header of a 3DGS PLY of ``count`` Gaussians, whose :func:`row_table` follows."""
+    """The header of a 3DGS PLY of ``count`` Gaussians, to be followed by :func:`row_table`."""
     names = column_names(3 * ((sh_degree + 1) ** 2 - 1))
     lines = [*first_lines(traits), f"element vertex {count}"]
     return "\n".join(
@@ -372,9 +369,8 @@ def header_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> bytes:
 
 
 def ply_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
-    """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a
-    Gaussian (normals included) and three for each SH coefficient beyond the constant one, as
-    float32."""
+    """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then per Gaussian 17
+    float32 (including normals) and three per SH coefficient beyond the constant one."""
     return (
         len(header_bytes(count, sh_degree, traits))
         + 4 * (17 + 3 * ((sh_degree + 1) ** 2 - 1)) * count
@@ -382,7 +378,8 @@ def ply_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
 
 
 def column_names(rest: int) -> list[str]:
-    """All vertex properties in the order of files, with so many of SH beyond the constant one."""
+    """All vertex properties in file order, with ``rest`` SH coefficients beyond the constant
+    one."""
     first = [*COLUMNS["means"], *COLUMNS["normals"], *COLUMNS["features_dc"]]
     last = [*COLUMNS["opacities"], *COLUMNS["scales"], *COLUMNS["quats"]]
     return [*first, *(f"f_rest_{i}" for i in range(rest)), *last]

@@ -1,8 +1,7 @@
-"""Parses the header of a PLY file, of limited length.
+"""Parses the header of a PLY file, within a limited length.
 
-It is parsed before anything is allocated for the data, so that a damaged or hostile header (a count
-of 10^15, a header without an end) does no harm. Readers check its counts against the size of the
-file.
+The header is parsed before memory is allocated for the data, so that a damaged or hostile header (a
+count of 10^15, or no end) does no harm. Readers check its counts against the file size.
 """
 
 from __future__ import annotations
@@ -68,19 +67,19 @@ class Header:
     """A parsed PLY header."""
 
     order: str
-    """``"<"``, ``">"`` or, for an ASCII file, the empty string."""
+    """``"<"``, ``">"``, or empty for an ASCII file."""
     elements: tuple[Element, ...]
     size: int
-    """Bytes of the header: where the data starts."""
+    """Length of the header, bytes: offset of the data."""
     comments: tuple[str, ...] = ()
     """Text of the comments."""
 
     def before(self, name: str) -> tuple[Element, ...]:
-        """The elements that precede the one called ``name``."""
+        """The elements before the element ``name``."""
         return self.elements[: [element.name for element in self.elements].index(name)]
 
     def up_to(self, name: str) -> bytes:
-        """The header as ASCII bytes, without comments, up to the element called ``name``."""
+        """The header as ASCII bytes, without comments, through the element ``name``."""
         form = next(form for form, order in _ORDERS.items() if order == self.order)
         lines = ["ply", f"format {form} 1.0"]
         for element in self.elements[: len(self.before(name)) + 1]:
@@ -91,8 +90,8 @@ class Header:
 
 def read_header(stream: BinaryIO, path: Path) -> Header:
     """Parse the header at the start of ``stream``, which is left at an unspecified position. Vertex
-    properties have the names of 3DGS, without prefixes. Raises SceneError if it is not a PLY
-    header, has no end, or has a line that is not valid PLY."""
+    properties get 3DGS names, without prefixes. Raises SceneError if it is not a PLY header, does
+    not end, or has an invalid line."""
     text, size = _header_text(stream, path)
     order: str | None = None
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
@@ -106,7 +105,7 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
             case ["format", form, "1.0"] if form in _ORDERS:
                 order = _ORDERS[form]
             case ["element", name, count] if count.isascii() and count.isdigit():
-                # A number of over 18 digits exceeds every file; cut short, it still does.
+                # More than 18 digits exceed the size of every file, also when truncated to 18.
                 elements.append((name, int(count[:19]), []))
             case ["property", kind, name] if elements and kind in _TYPES:
                 elements[-1][2].append((name, _TYPES[kind]))
@@ -127,11 +126,11 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     for name, _, properties in elements:
         _reject_duplicates([prop for prop, _ in properties], f"{name} property", path)
         names = {prop for prop, _ in properties}
-        # by CloudCompare
+        # CloudCompare's prefixes
         prefixed = r"(?:scalar_)?(?:scal_)?(f_dc_\d|f_rest_\d+|opacity|scale_\d|rot_\d|filter_3D)"
         for index, (prop, kind) in enumerate(properties):
             found = re.fullmatch(prefixed, prop) if name == "vertex" else None
-            if found and found[1] not in names:  # nor a second one with another prefix
+            if found and found[1] not in names:  # unless the plain name exists
                 names.add(found[1])
                 properties[index] = found[1], kind
     return Header(
@@ -143,8 +142,7 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
 
 
 def first_lines(traits: Traits) -> list[str]:
-    """The lines of a header before its elements. Comments are those that :func:`traits_of`
-    reads."""
+    """The header lines before the elements, with comments for :func:`traits_of`."""
     comments = ["SplatRenderMode: mip"] * traits.antialiased
     comments += [] if traits.up is None else [f"Vertical Axis: {traits.up}"]
     comments += [] if traits.offset is None else [f"Offset: {offset_text(traits.offset)}"]
@@ -156,8 +154,8 @@ def first_lines(traits: Traits) -> list[str]:
 
 
 def traits_of(header: Header, path: Path) -> Traits:
-    """The traits of a scene that a header's comments declare; the last comment on each counts. Ways
-    of rendering other than ordinary and antialiased are warned of.
+    """The traits that a header's comments declare; the last comment on each wins. Rendering modes
+    other than ordinary and antialiased are logged as a warning.
 
     Brush and splat-transform write ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot
     ``antialiased 0`` or ``1``, nerfstudio ``Vertical Axis: z``.
@@ -181,7 +179,7 @@ def traits_of(header: Header, path: Path) -> Traits:
             and words[2].removeprefix("+") in AXES
         ):
             up = words[2].removeprefix("+")
-        elif comment.startswith("Offset: "):  # three numbers that are added to x, y and z
+        elif comment.startswith("Offset: "):  # three numbers to add to x, y and z
             offset = offset_of_text(comment.removeprefix("Offset: "))
             if offset is None:
                 logger.warning(
@@ -191,18 +189,16 @@ def traits_of(header: Header, path: Path) -> Traits:
 
 
 def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:
-    """Lines of the header up to ``end_header``, and the number of bytes they take."""
-    most = (
-        1 << 20
-    )  # a 3DGS header has about 1.5 kB; comments may make it longer, but not by a thousandfold
+    """Lines of the header up to ``end_header``, and their length in bytes."""
+    # a 3DGS header has about 1.5 kB, with comments less than a thousand times as much
+    most = 1 << 20
     start = stream.read(most)
     if start[:4] not in (b"ply\n", b"ply\r"):
         raise SceneError(
             f"{path}: not a PLY file (starts with {start[:4]!r}); expected the line 'ply'"
         )
     newline = b"\n" if start[3:4] == b"\n" else b"\r\n" if start[4:5] == b"\n" else b"\r"
-    # Some programs write spaces after the keyword. The newline may be missing where nothing
-    # follows.
+    # Some programs write spaces after the keyword. Without data, the newline may be missing.
     found = re.compile(newline + rb"end_header[ \t]*(" + newline + rb"|\Z)").search(start)
     if found is None:
         why = "is truncated" if len(start) < most else f"is longer than {most} bytes"

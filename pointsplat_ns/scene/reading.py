@@ -38,14 +38,14 @@ SCENE_KINDS = (
 
 
 def is_scene_file(path: Path | str) -> bool:
-    """Whether :func:`read_scene` takes a file for a whole scene, by its suffix. Runs and SOG
-    folders, streamed or not, are recognised by their content instead."""
+    """Whether a file is a scene by its suffix. Runs and SOG folders, streamed or not, are
+    recognised by content instead."""
     kind = format_named(Path(path).name)
     return kind is not None and kind.read is not None and kind.suffix.startswith(".")
 
 
 def is_folder_of_scenes(path: Path | str) -> bool:
-    """Whether a path is a folder that is no scene itself, as those of runs and SOG folders are."""
+    """Whether a path is a folder, but not a scene itself, as folders of runs and SOG are."""
     path = Path(path)
     return (
         path.is_dir() and not (path / RUN_FILES.config).is_file() and format_to_read(path) is None
@@ -53,20 +53,19 @@ def is_folder_of_scenes(path: Path | str) -> bool:
 
 
 def read_scene(path: Path | str, all_rows: bool = False) -> Gaussians:
-    """Read a scene: a file of any format, a checkpoint, or the newest checkpoint of a Splatfacto
-    run.
+    """Read a scene: a file of any format, a checkpoint, or the newest checkpoint of a run.
 
     Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number
     is logged. Positions that are doubles far from the origin, as in geo-referenced PLYs, are read
-    relative to an offset, which is that of the scene. Where float32 has lost their digits already,
-    that is logged. The content of a file decides its format, else its name.
+    relative to the scene's offset. If float32 positions have already lost precision, a warning is
+    logged. The format is identified by content, or else by name.
 
     Args:
-        path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json``
-            in it), a streamed SOG (``lod-meta.json`` or its folder, of which the finest level is
+        path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or its
+            ``meta.json``), a streamed SOG (``lod-meta.json`` or its folder; the finest level is
             read), ``.splat``, a checkpoint of Splatfacto (``.ckpt``) or gsplat (``.pt``),
             ``config.yml`` or a run's folder. The photos of a run are not needed.
-        all_rows: whether Gaussians that cannot be drawn are kept.
+        all_rows: whether to include Gaussians that cannot be drawn.
 
     Returns:
         The scene, float32 on the CPU. Log-scales and logits are those of the file.
@@ -91,8 +90,8 @@ def read_scene(path: Path | str, all_rows: bool = False) -> Gaussians:
 
 
 def _found(path: Path) -> tuple[Callable[[Path], Gaussians], Path, str, Run | None]:
-    """The reader of a scene, the file to read, the name of its kind, and the run that it belongs
-    to, if it does. Raises SceneError as :func:`read_scene`."""
+    """The reader of a scene, the file to read, its kind, and the run that it belongs to, or None.
+    Raises SceneError as :func:`read_scene`."""
     is_run = path.is_dir() and (path / RUN_FILES.config).is_file()
     if not path.is_dir():
         require_file(path, SCENE_KINDS)
@@ -101,7 +100,7 @@ def _found(path: Path) -> tuple[Callable[[Path], Gaussians], Path, str, Run | No
         assert kind.read is not None
         run = None
         if kind.read is read_checkpoint:
-            with suppress(SceneError):  # it lies outside of one
+            with suppress(SceneError):  # the checkpoint is not in a run
                 run = open_run(path, need_data=False)
         return kind.read, path, kind.name, run
     if is_run or path.suffix.lower() in (".yml", ".yaml"):
@@ -116,8 +115,8 @@ def _found(path: Path) -> tuple[Callable[[Path], Gaussians], Path, str, Run | No
 
 
 def kind_of(path: Path | str) -> str:
-    """What a path is that :func:`read_scene` reads: the name of a format, such as "SPZ", or a run
-    or a checkpoint in one with its method and step. Raises SceneError as :func:`read_scene`.
+    """Kind of a path for :func:`read_scene`: a format name, such as "SPZ", or a run or its
+    checkpoint, with method and step. Raises SceneError as :func:`read_scene`.
 
     Example:
         >>> from pathlib import Path
@@ -136,23 +135,23 @@ def kind_of(path: Path | str) -> str:
 def save(
     scene: Gaussians, path: Path | str, progress: bool | Progress = False, overwrite: bool = False
 ) -> None:
-    """Write a scene in the format that the path's name asks for.
+    """Write a scene in the format of the path's suffix.
 
-    ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. ``.spz`` (version
-    3), ``.sog`` and ``.splat`` keep fewer bits. Gaussians that cannot be drawn (NaN, or Inf where
-    it is not valid) are left out, and their number is logged. The file appears whole or not at all.
+    ``.ply`` is the 3DGS PLY: a float32 scene is read back exact to the bit. ``.spz`` (version 3),
+    ``.sog`` and ``.splat`` have fewer bits. Gaussians that cannot be drawn (NaN, or Inf where it is
+    not valid) are dropped, and their number is logged. The write is atomic.
 
     Args:
         scene: N Gaussians of SH degree d, on any device and of any floating dtype. In a PLY each
             takes 68 + 12 K bytes, with K = (d+1)^2 - 1 and 12 bytes of unused normals.
-        path: a path that ends in one of these. Missing folders are created.
-        progress: True shows a bar; a function is called with what is being done and the share done
-            of it.
-        overwrite: whether an existing file is replaced.
+        path: ends in one of these suffixes. Missing folders are created.
+        progress: True shows a progress bar; a function is called with the current step and its
+            share done.
+        overwrite: whether to replace an existing file.
 
     Raises:
-        SceneError: if the path has another suffix, is a folder, cannot be written, or exists and is
-            not to be replaced.
+        SceneError: if the path has another suffix, is a folder, cannot be written, or exists
+            without ``overwrite``.
 
     Example:
         >>> import tempfile
@@ -181,8 +180,8 @@ def save_as(
     progress: Progress = silent,
     name: Path | str | None = None,
 ) -> None:
-    """Write a scene in a format that is written, whatever the path's name, and warn of what the
-    format does not hold; otherwise as :func:`save`. ``name`` is the path in the warning."""
+    """Write a scene in a given format, whatever the path's suffix, and warn about losses; otherwise
+    as :func:`save`. ``name`` is the path in the warning."""
     assert kind.write is not None
     scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
     warn_of_losses(kind, scene, name or path)
@@ -190,7 +189,7 @@ def save_as(
 
 
 def warn_of_losses(kind: Format, scene: Gaussians, name: Path | str) -> None:
-    """Log what a format does not hold of a scene, float32 on the CPU, and which format does."""
+    """Log the losses of a scene, float32 on the CPU, in a format, and a format without them."""
     found = losses(scene, kind.capacity)
     if found:
         others = (format_named(suffix) for suffix in (".sog", ".ply"))
@@ -206,16 +205,16 @@ class SourceFile(NamedTuple):
     """The file that a dense scene was read from."""
 
     name: str
-    """Of a SOG folder, streamed or not, that of the folder."""
+    """For a SOG folder, streamed or not, that folder."""
     bytes: int
-    """Of all files of the folder."""
+    """Total of all files of a folder."""
     sha256: str
-    """That of the lines "path hash" of the folder's files, by their paths in it."""
+    """For a folder, the hash of the lines "path hash" of its files, sorted by relative path."""
 
 
 def source_file(path: Path | str) -> SourceFile:
     """The file that :func:`~pointsplat_ns.scene.read_scene` reads a scene from: for a run, its
-    checkpoint. Raises SceneError if there is none, or it cannot be read."""
+    checkpoint. Raises SceneError if it is missing or cannot be read."""
     parts = source_parts(path)
     hashes = {part: content_hash(part) for part in parts}
     size = sum(part.stat().st_size for part in parts)
@@ -232,8 +231,8 @@ def source_file(path: Path | str) -> SourceFile:
 
 
 def source_parts(path: Path | str) -> list[Path]:
-    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the
-    checkpoint of a run, or one. Raises SceneError if a run has none, or a folder cannot be read."""
+    """The files of a scene: all of a SOG folder, by name, streamed or not; the checkpoint of a run;
+    or one file. Raises SceneError if a run has no checkpoint, or a folder cannot be read."""
     path = Path(path)
     folder = path.parent if path.name in (SOG_META, STREAM_META) else path
     streamed = path.name != SOG_META and (folder / STREAM_META).is_file()

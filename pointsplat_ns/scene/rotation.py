@@ -1,4 +1,4 @@
-"""Turns, mirrors, scales and moves scenes."""
+"""Rotates, mirrors, scales and moves scenes."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 
 def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaussians:
-    """A scene whose positions, rotations, SH and declared up axis are turned about the origin. An
-    up direction that is no axis any more is not declared.
+    """Rotate positions, Gaussians, SH and the declared up axis about the origin. An up direction
+    that is no longer an axis is dropped.
 
     Args:
         scene: N Gaussians.
-        matrix: (3, 3) float64, orthogonal: the factor on positions. A determinant of -1 mirrors. A
+        matrix: (3, 3) float64, orthogonal, applied to positions. A determinant of -1 mirrors. A
             reflection through the origin leaves covariances, and so the rotations of Gaussians,
             unchanged.
-        quat: (4,) wxyz, unit: the rotation in the matrix, by default computed. Its sign is that of
-            the quaternions.
+        quat: (4,) wxyz, unit: the rotation part of the matrix, by default computed. Its sign
+            determines the sign of the quaternions.
     """
     from kornia.geometry.quaternion import Quaternion
 
@@ -63,21 +63,20 @@ def _times(offset: Offset | None, matrix: Tensor) -> Offset | None:
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Turns a scene, scales it, and moves it: a point x becomes ``scale * matrix @ x + offset``."""
+    """Rotates, scales and moves a scene: a point x becomes ``scale * matrix @ x + offset``."""
 
     matrix: Tensor  # [3, 3] float64, orthogonal; a determinant of -1 mirrors
     scale: float  # above 0
     offset: Tensor  # [3] float64
 
     def inverse(self) -> Similarity:
-        """The similarity that undoes this one."""
+        """The inverse similarity."""
         return Similarity(
             self.matrix.T, 1 / self.scale, -(self.matrix.T @ self.offset) / self.scale
         )
 
     def apply(self, scene: Gaussians) -> Gaussians:
-        """The scene after the transform. Its SH are turned too; a mirrored scene has mirrored
-        SH."""
+        """The scene after the transform; SH are rotated or mirrored with it."""
         moved = turned(scene.to(dtype=torch.float64), self.matrix)
         return moved.replace(
             means=moved.means * self.scale + self.offset.to(moved.means),

@@ -31,9 +31,9 @@ class RunFiles:
 
     config: str = "config.yml"
     transforms: str = "dataparser_transforms.json"
-    """The transform of the dataset from the frame of its poses to that of the scene."""
+    """Transform from the frame of the dataset's poses to that of the scene."""
     refiner: str = "refiner.safetensors"
-    """Weights of the refiner that the run trained."""
+    """Weights of the refiner trained by the run."""
 
 
 RUN_FILES = RunFiles()
@@ -41,12 +41,12 @@ RUN_FILES = RunFiles()
 
 @dataclass(frozen=True)
 class MethodNames:
-    """nerfstudio's names of the methods of this package."""
+    """Names of this package's methods in nerfstudio."""
 
     scene: str = "splatfacto-cpu"
     """Trains scenes."""
     refiner: str = "pointsplat"
-    """Trains refiners; so do its presets, whose names begin with this and a hyphen."""
+    """Trains refiners; presets append a hyphen and a name."""
 
 
 METHOD_NAMES = MethodNames()
@@ -54,21 +54,21 @@ METHOD_NAMES = MethodNames()
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trained nerfstudio run. Settings are those of ``config.yml``; objects nested in them are
+    """A trained nerfstudio run. Settings come from ``config.yml``; nested objects are
     :class:`~pointsplat_ns.scene.inert_yaml.Tagged`."""
 
     folder: Path
     config_path: Path
     checkpoint: Path
-    """The newest complete checkpoint, or the one that was asked for."""
+    """The newest complete checkpoint, or the requested one."""
     step: int
     method_name: str
     experiment_name: str
-    """As configured; empty or "unnamed" where the user gave none."""
+    """As configured; empty or "unnamed" if the user gave none."""
     timestamp: str
     data: Path
-    """Training data of the run: a path that exists if :func:`open_run` was called with
-    ``need_data``, else the configured path."""
+    """Training data of the run: an existing path if :func:`open_run` was called with ``need_data``,
+    else the configured path."""
     dataparser_class: str
     """Dotted name of the dataparser's configuration class."""
     dataparser_fields: dict[str, Any]
@@ -87,25 +87,23 @@ class Run:
 
     @property
     def is_gaussian_scene(self) -> bool:
-        """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from
-        it."""
+        """Whether the checkpoint holds one Gaussian scene: Splatfacto or a derived method."""
         if self.is_refiner:
             return False
-        # Methods derived from Splatfacto have these settings, too.
+        # Methods derived from Splatfacto also have these settings.
         needed = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}
         return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= needed
 
     @property
     def rasterize_mode(self) -> Literal["classic", "antialiased"]:
-        """Rasterize mode that the run was trained with."""
+        """Rasterize mode of the run's training."""
         return (
             "antialiased" if self.model_fields.get("rasterize_mode") == "antialiased" else "classic"
         )
 
 
 def may_be_run(path: Path | str) -> bool:
-    """Whether a path is one that runs have: a folder, a checkpoint or YAML. Other files hold
-    nothing but a scene."""
+    """Whether a path can be a run: a folder, a checkpoint or YAML. All other files are scenes."""
     path = Path(path)
     return path.is_dir() or path.suffix.lower() in (".ckpt", ".yml", ".yaml")
 
@@ -114,16 +112,15 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
     """The run at ``path``.
 
     Args:
-        path: the run's folder, its ``config.yml``, or one of its checkpoints (which is then the one
-            used).
-        need_data: look for the data the run was trained on. A relative path is tried from the
+        path: the run's folder, its ``config.yml``, or one of its checkpoints, which is then used.
+        need_data: whether to search for the training data. A relative path is tried from the
             current folder, then from the run's folder and every folder above it.
-        data: where the data is now, if the run moved: the data itself, or a folder above it in
-            which the last names of the configured path are looked for.
+        data: where the data is now, if it moved: the data itself, or a folder above it. Below that
+            folder, the last parts of the configured path are searched for.
 
     Raises:
         SceneError: if ``path`` is not a run, has no complete checkpoint, or its data is needed and
-            not found.
+            missing.
     """
     path = Path(path)
     if not path.exists():
@@ -185,16 +182,16 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
 
 
 def scene_name(run: Run) -> str:
-    """A short name for the scene that can be a file name: the experiment's, or the data folder's if
-    it has none."""
+    """A short scene name that is valid as a file name: the experiment's, or else the data
+    folder's."""
     name = run.experiment_name if run.experiment_name != "unnamed" else ""
     data = run.data.parent if run.data.suffix else run.data
     return file_stem(name or data.name or run.folder.name)
 
 
 def name_of(path: Path) -> str:
-    """The name of a scene that can be a file name: that of its run, or else of its file."""
-    with suppress(SceneError):  # no run
+    """Scene name of a path, valid as a file name: that of its run, or else of its file."""
+    with suppress(SceneError):  # not a run
         return scene_name(open_run(path, need_data=False))
     return file_stem(path.stem)
 
@@ -207,7 +204,7 @@ def _tagged(parent: Tagged, name: str, path: Path) -> Tagged:
 
 
 def _settings(config: Tagged, *without: str) -> dict[str, Any]:
-    """Fields of a configuration object, except those that begin with ``_`` and those in
+    """Fields of a configuration object, except names that begin with ``_`` and those in
     ``without``."""
     return {
         key: value
@@ -217,7 +214,7 @@ def _settings(config: Tagged, *without: str) -> dict[str, Any]:
 
 
 def step_of(checkpoint: Path) -> int | None:
-    """The training step in a checkpoint's name, ``step-N.ckpt``; None if the name is another."""
+    """The training step in a checkpoint's name, ``step-N.ckpt``; None for any other name."""
     match = re.fullmatch(r"step-(\d{1,18})\.ckpt", checkpoint.name)
     return int(match[1]) if match else None
 
@@ -248,8 +245,8 @@ def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Pat
 
 
 def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str | None) -> Path:
-    """The data of the run in a folder on this machine: its configured path, from the current folder
-    or from the run's or one above; or at or below ``place``, by as many last names of the
+    """The data of the run on this machine. Tries the configured path from the current folder and
+    from the run's folder and those above; or at or below ``place``, with as many last parts of the
     configured path as possible."""
     if named == Path() and place is None:
         raise SceneError(
@@ -259,12 +256,12 @@ def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str 
         names = [name for name in named.parts if name not in (named.anchor, "..", "~")]
         tried = [Path(place, *names[first:]) for first in range(len(names) + 1)]
     else:
-        with suppress(RuntimeError):  # "~nobody": a user whom this machine does not know
+        with suppress(RuntimeError):  # "~nobody": unknown user
             named = named.expanduser()
         home = folder.resolve()
         tried = list(dict.fromkeys(above / named for above in (Path.cwd(), home, *home.parents)))
     for candidate in tried:
-        with suppress(OSError):  # a name that is too long, a folder that may not be looked into
+        with suppress(OSError):  # name too long, or folder not readable
             if candidate.exists():
                 return candidate
     if place is not None:
@@ -276,14 +273,14 @@ def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str 
         f" and {len(tried) - 3} more above" if len(tried) > 3 else ""
     )
     raise SceneError(
-        f"{config_path}: its data {named} is not there; tried {places}; "
-        "name the folder where it is now (--data DIR), or put the data back"
+        f"{config_path}: its data {named} is missing; tried {places}; pass its folder with --data "
+        "DIR, or move the data back"
     )
 
 
 def read_transforms(path: Path) -> tuple[Tensor, float]:
-    """The transform (3, 4) and the scale of a ``dataparser_transforms.json``; the identity and 1 if
-    there is none. Raises SceneError if the file is not one."""
+    """The transform (3, 4) and the scale of a ``dataparser_transforms.json``; identity and 1 if the
+    file is missing. Raises SceneError if it has another content."""
     if not path.is_file():
         return torch.eye(4, **FLOATS)[:3], 1.0
     try:

@@ -1,4 +1,4 @@
-"""Scenes as they are read and written: without the Gaussians that cannot be drawn."""
+"""Removes Gaussians that cannot be drawn, when scenes are read and written."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pointsplat_ns.system.files import logger
 
 
 def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
-    """``scene`` without infinite values, and without the Gaussians that cannot be drawn, whose
+    """``scene`` without infinite values and without the Gaussians that cannot be drawn, whose
     number is logged.
 
-    Opacity logits of +-Inf (opacity 1 and 0) and log-scales of -Inf (a flat axis) can be drawn (see
-    :meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable`). They become +-30 and -87, which draw the
-    same in float32.
+    Drawable Gaussians may have opacity logits of +-Inf (opacity 1 and 0) and log-scales of -Inf (a
+    flat axis), see :meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable`. These become +-30 and
+    -87, which draw the same in float32.
     """
     usable = usable_part(scene)
     dropped = len(scene) - len(usable)
@@ -26,7 +26,7 @@ def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
 
 
 def usable_part(scene: Gaussians) -> Gaussians:
-    """As :func:`keep_usable`, always, and without a warning."""
+    """As :func:`keep_usable`, but without logging."""
     usable = scene.usable()
     if not bool(usable.all()):
         scene = scene[usable]

@@ -13,20 +13,20 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 RasterizeMode = Literal["classic", "antialiased"]
-"""The rasterize mode of a scene's training (nerfstudio's ``rasterize_mode``)."""
+"""Rasterize mode of a scene's training (nerfstudio's ``rasterize_mode``)."""
 
 NEAR_PLANE = 0.01
 """Near plane of gsplat, scene units."""
 
 EPS2D = 0.3
-"""Added to the diagonal of each projected covariance, pixels^2: nothing is thinner than a pixel. As
-in 3DGS, gsplat."""
+"""Added to the diagonal of each projected covariance, pixels^2, so that no Gaussian is thinner than
+a pixel. As in 3DGS and gsplat."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One pinhole camera and its rendering settings: an element of :class:`Views`, which explains
-    its attributes.
+    """One pinhole camera with rendering settings: an element of :class:`Views`, which documents its
+    attributes.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -47,30 +47,31 @@ class View:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Views:
-    """C pinhole cameras of one image size and their rendering settings.
+    """C pinhole cameras of one image size, and rendering settings.
 
     ``views[0]`` and iteration give a :class:`View`; slices, lists of indices, index tensors and
     boolean masks give :class:`Views`.
 
     Attributes:
-        viewmats: (C, 4, 4), take world to camera coordinates, OpenCV axes (x right, y down, z
-            forward); rigid motions in scene units.
-        Ks: (C, 3, 3) intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
+        viewmats: (C, 4, 4) world-to-camera, OpenCV axes (x right, y down, z forward); rigid, in
+            scene units.
+        Ks: (C, 3, 3) intrinsics in pixels; the centre of the first pixel is (0.5, 0.5).
         width: width of every image, pixels.
         height: height of every image, pixels.
         background: (3,) colour behind the scene, RGB in [0, 1].
         rasterize_mode: "classic" or "antialiased", as in the scene's training.
-        near_plane: least depth of drawn Gaussians, scene units; gsplat's by default.
-        eps2d: added to the diagonal of each projected covariance, pixels^2; 3DGS' by default.
+        near_plane: minimum depth of drawn Gaussians, scene units; default as in gsplat.
+        eps2d: added to the diagonal of each projected covariance, pixels^2; default as in 3DGS.
 
     Raises:
-        DataError: if a shape does not fit the others, or the image has no pixel.
+        DataError: if a shape does not match the others, or the image has no pixels.
 
     Example:
         >>> import torch
         >>> import pointsplat_ns as ps
         >>> K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
-        >>> views = ps.Views(torch.eye(4).repeat(3, 1, 1), K.repeat(3, 1, 1), 64, 48, torch.zeros(3))
+        >>> poses = torch.eye(4).repeat(3, 1, 1)
+        >>> views = ps.Views(poses, K.repeat(3, 1, 1), 64, 48, torch.zeros(3))
         >>> len(views), len(views[1:]), views[0].width
         (3, 2, 64)
     """
@@ -117,7 +118,7 @@ class Views:
     def __getitem__(self, index: slice | list[int] | Tensor) -> Views: ...
 
     def __getitem__(self, index: Any) -> View | Views:
-        """One view by an integer; several by a slice, a list or tensor of indices, or a boolean
+        """One view for an integer; several for a slice, a list or tensor of indices, or a boolean
         mask (C,).
 
         Raises:
@@ -140,8 +141,8 @@ class Views:
         return (self[index] for index in range(len(self)))
 
     def relative_to(self, offset: tuple[float, float, float] | None) -> Views:
-        """The same views for a scene whose positions are relative to an offset, scene units;
-        computed in float64."""
+        """The views for a scene with positions relative to an offset, scene units; computed in
+        float64."""
         if offset is None:
             return self
         viewmats = self.viewmats.double()
@@ -150,15 +151,14 @@ class Views:
         return replace(self, viewmats=moved.to(self.viewmats.dtype))
 
     def spread(self, count: int) -> Views:
-        """At most ``count`` of the views, evenly spread over their order, with the first and the
-        last."""
+        """At most ``count`` of the views, evenly spaced, with the first and the last."""
         if count >= len(self):
             return self
         return self[spread_indices(len(self), count)]
 
     def resized(self, max_side: int) -> Views:
-        """The same views with the longer side of the image at most ``max_side`` pixels; images are
-        never enlarged."""
+        """The views with the longer side of the image at most ``max_side`` pixels; never
+        enlarges."""
         factor = max_side / max(self.width, self.height)
         if factor >= 1:
             return self
@@ -169,7 +169,7 @@ class Views:
 
 
 def spread_indices(length: int, count: int) -> list[int]:
-    """At most ``count`` indices below ``length``, evenly spread, with the first and the last."""
+    """At most ``count`` indices below ``length``, evenly spaced, with the first and the last."""
     if count >= length:
         return list(range(length))
     return torch.linspace(0, length - 1, count, **FLOATS).round().long().tolist()

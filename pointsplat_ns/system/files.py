@@ -1,5 +1,4 @@
-"""Helpers of all readers and writers: checks of files and of places for files, hashes, atomic
-writes."""
+"""Shared by readers and writers: checks of paths and free space, hashes, atomic writes."""
 
 from __future__ import annotations
 
@@ -40,8 +39,8 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 def require_file(path: Path | str, what: str) -> Path:
-    """``path`` as a Path. Raises SceneError if it is no regular file, which says that ``what`` was
-    expected."""
+    """``path`` as a Path. Raises SceneError, with ``what`` was expected, if it is not a regular
+    file."""
     path = Path(path)
     if not path.exists():
         raise SceneError(f"{path}: no such file; expected {what}")
@@ -51,15 +50,15 @@ def require_file(path: Path | str, what: str) -> Path:
 
 
 def read_text(path: Path, most: int = 1 << 26) -> str:
-    """The text of a small file, which is not opened if it may have no end.
+    """Text of a small file. Never opens pipes or devices, which may not end.
 
     Args:
         path: the file, in UTF-8.
-        most: largest size, bytes.
+        most: maximum size, bytes.
 
     Raises:
         OSError: if it is missing, a folder, a pipe or a device, or cannot be read.
-        ValueError: if it is larger, or no text.
+        ValueError: if it is larger, or not text.
     """
     with open_regular(path) as stream:
         content = stream.read(most + 1)
@@ -80,8 +79,8 @@ def failure_named(path: Path, what: str) -> Iterator[None]:
 
 
 def require_memory(path: Path | str, size: int) -> None:
-    """Raise a SceneError if ``size`` bytes, which a file's content takes, are not free. A sparse
-    file, whose zeros take no disk space, may claim any size."""
+    """Raise a SceneError if less than ``size`` bytes of memory are free for a file's content. The
+    declared size need not be real: zeros of a sparse file take no disk space."""
     import psutil
 
     free = psutil.virtual_memory().available
@@ -93,11 +92,11 @@ def require_memory(path: Path | str, size: int) -> None:
 
 
 def content_hash(path: Path | str) -> str:
-    """SHA-256 of a file's bytes, as 64 hexadecimal digits. The file is read in pieces: it need not
+    """SHA-256 of a file's bytes, as 64 hexadecimal digits. Reads the file in pieces, so it need not
     fit into memory.
 
     Raises:
-        SceneError: if there is no such file, or it cannot be read.
+        SceneError: if the file is missing or cannot be read.
     """
     path = require_file(path, "a scene to read")
     digest = hashlib.sha256()
@@ -108,16 +107,16 @@ def content_hash(path: Path | str) -> str:
 
 
 def one_line(error: BaseException, limit: int = 160) -> str:
-    """The first line of an exception's text, at most ``limit`` characters; the name of its type if
-    it has no text."""
+    """First line of an exception's text, at most ``limit`` characters; its type name if the text is
+    empty."""
     lines = str(error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 def file_stem(text: str) -> str:
-    """``text`` as a file name: other characters than letters, digits and ``_ . + -`` become ``-``;
-    "scene" if nothing is left."""
+    """``text`` as a file name: characters other than letters, digits and ``_ . + -`` become ``-``;
+    "scene" if the result is empty."""
     return re.sub(r"[^\w.+-]+", "-", text).strip("-.") or "scene"
 
 
@@ -129,21 +128,21 @@ def replacing(
     named: bool = True,
     new: bool = False,
 ) -> Iterator[Path]:
-    """A temporary path beside ``path`` to write to. It replaces ``path`` when the block ends
-    without an error, else it is removed.
+    """A temporary path beside ``path`` to write to. It replaces ``path`` if the block ends without
+    an error, and is removed otherwise.
 
-    Missing parent folders are created, and removed after an error if they are empty. Through a
-    symbolic link, its target is written. A file that is replaced keeps its mode. Of several writers
-    of one path, each has a temporary path of its own, and the last one's file stays. A name that
-    :func:`need_writable` claimed is taken only if it is still free.
+    Missing parent folders are created, and removed after an error if they are empty. A symbolic
+    link is followed: its target is replaced. A replaced file keeps its mode. Concurrent writers of
+    one path use different temporary paths, and the last one wins. A name that
+    :func:`need_writable` claimed is written only if it is still free.
 
     Args:
         path: the file.
-        size: bytes that will be written, if that is known; they must be free.
-        folder: where the temporary path is instead, on the same file system.
-        named: whether a person named the file. If not, a symbolic link there is replaced itself:
-            somebody else made it, as in a folder that came from elsewhere.
-        new: whether nothing may be replaced, as for a claimed name.
+        size: number of bytes to be written, if known; they must be free.
+        folder: folder of the temporary path, on the same file system; by default that of ``path``.
+        named: whether the user named the file. If not, a symbolic link is itself replaced, because
+            it may come from elsewhere, as in a downloaded folder.
+        new: whether to refuse replacing a file, as for a claimed name.
 
     Raises:
         SceneError: if ``path`` is a folder or a device, cannot be written, or may not be replaced.
@@ -160,11 +159,11 @@ def replacing(
             mode = None if foreign or new else _mode_of(target)
             made = make_folders(target.absolute().parent)
             require_space(path, target.parent, size)
-            # No other process or thread has this name, on no machine.
+            # Unique over processes, threads and machines.
             name = f".{short_name(target)}.{os.getpid()}-{secrets.token_hex(4)}.part"
             part = (folder or target.parent) / name
             if mode is not None:
-                part.touch(0o600)  # nobody else reads it before it is complete
+                part.touch(0o600)  # unreadable for others until it is complete
             yield part
             if mode is not None:
                 part.chmod(mode)
@@ -180,7 +179,7 @@ def replacing(
             written(path)
     finally:
         if part is not None:
-            with suppress(OSError):  # it may never have been there; the error above says why
+            with suppress(OSError):  # it may not exist; the error above says why
                 part.unlink()
         if not done:
             remove_empty(made)
@@ -190,19 +189,19 @@ def replacing(
 def replacing_folder(
     folder: Path, last: str, ours: str, force: bool, named: bool = True
 ) -> Iterator[Path]:
-    """A temporary folder beside ``folder`` to write to. Its files are in ``folder`` when the block
-    ends without an error: all of them, or, after an error or a signal, those that were there
-    before, see :func:`~pointsplat_ns.system.outputs.put_folder`.
+    """A temporary folder beside ``folder`` to write to. If the block ends without an error, its
+    files move to ``folder``. After an error or a signal, ``folder`` has its previous files, see
+    :func:`~pointsplat_ns.system.outputs.put_folder`.
 
     Args:
-        folder: made if it is missing.
-        last: the file that tells of all others.
-        ours: pattern of the names in ``folder`` that an earlier call wrote.
-        force: whether these may be replaced.
-        named: whether a person named the folder. If not, it may be no symbolic link.
+        folder: created if missing.
+        last: the index file.
+        ours: pattern of the file names that an earlier call wrote.
+        force: whether to replace these files.
+        named: whether the user named the folder. If not, it must not be a symbolic link.
 
     Raises:
-        SceneError: if the folder cannot be written, or holds what may not be replaced.
+        SceneError: if the folder cannot be written, or has files that may not be replaced.
     """
     folder = Path(folder)
     need_folder(folder, named)
@@ -210,7 +209,7 @@ def replacing_folder(
     with failure_named(folder, "written"), temporary_folder(target) as part:
         try:
             yield part
-        except SceneError as error:  # of a file that has no name yet
+        except SceneError as error:  # about a file that has no name yet
             raise SceneError(f"{error}".replace(str(part), str(folder))) from error
         try:
             put_folder(part, target, last, ours, force)
@@ -227,26 +226,26 @@ def need_suffix(path: Path, suffix: str) -> None:
 
 
 def need_new(path: Path, force: bool) -> None:
-    """Raise a SceneError if a path exists and may not be replaced. Else its name is claimed, see
+    """Raise a SceneError if a path exists, unless ``force``. Otherwise claim its name, see
     :func:`~pointsplat_ns.system.outputs.claim`, unless it may be replaced."""
     target = _target_of(path)
     if not force and not target.exists():
         claim(path)
-    if not force and target.exists():  # also if another command has just finished it
+    if not force and target.exists():  # also if another command has just written it
         raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
 
 
 def need_writable(path: Path, force: bool) -> None:
     """Raise a SceneError if a file cannot be written: it is a folder, a pipe or a device, its
-    folder takes none, or it exists and ``force`` does not allow to replace it."""
+    folder is not writable, or it exists and ``force`` is not set."""
     with failure_named(path, "written"):
         _need_place(path, _target_of(path).absolute().parent)
         need_new(path, force)
 
 
 def need_folder(path: Path, named: bool = True) -> None:
-    """Raise a SceneError if nothing can be written to a folder, which may be missing, or if it is a
-    symbolic link that nobody ``named``."""
+    """Raise a SceneError if a folder, which may be missing, is not writable, or if it is a symbolic
+    link and the user has not ``named`` it."""
     if path.is_symlink() and (not named or is_unnamed(path)):
         raise SceneError(
             f"{path}: a link to {os.path.realpath(path)}, which the command did not name; remove "
@@ -259,31 +258,27 @@ def need_folder(path: Path, named: bool = True) -> None:
 
 
 def _need_place(path: Path, folder: Path) -> None:
-    """Raise a SceneError, about ``path``, if a folder cannot be written to, or cannot be made."""
+    """Raise a SceneError about ``path`` if a folder cannot be written to or created."""
     above = next(place for place in (folder, *folder.parents) if place.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        why = "is no folder" if not above.is_dir() else "takes no files"
+        why = "is not a folder" if not above.is_dir() else "is not writable"
         raise SceneError(f"{path}: cannot be written ({above} {why})")
 
 
 def _target_of(path: Path) -> Path:
-    """The file that is written for ``path``: the target of a symbolic link, else ``path`` itself.
+    """The file to write for ``path``: the target of a symbolic link, else ``path`` itself.
 
     Raises:
-        SceneError: if it is a folder, a device or a pipe, a link to what is not there, or no name
-            of a file.
+        SceneError: if it is a folder, a device or a pipe, a broken link, or not a valid file name.
     """
     if "\0" in str(path):
         raise SceneError(
-            f"{str(path)!r}: holds a NUL character; expected the name of a file to write"
+            f"{str(path)!r}: contains a NUL character; expected the name of a file to write"
         )
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
-    if target != path and not os.path.lexists(
-        target
-    ):  # whoever made the link may want a file to appear there
-        raise SceneError(
-            f"{path}: a link to {target}, where nothing is; remove it, or name that file"
-        )
+    # a link from elsewhere may aim at creating its target
+    if target != path and not os.path.lexists(target):
+        raise SceneError(f"{path}: a broken link to {target}; remove it, or name that file")
     if target.is_dir():
         raise SceneError(f"{path}: is a folder; expected the name of a file to write")
     _mode_of(target)
@@ -291,10 +286,10 @@ def _target_of(path: Path) -> Path:
 
 
 def require_space(path: Path, folder: Path, size: int) -> None:
-    """Raise a SceneError if the disk has less than ``size`` bytes. A file that is replaced stays
+    """Raise a SceneError if the disk has less than ``size`` bytes free. A replaced file takes space
     until the end."""
     disk = shutil.disk_usage(folder)
-    if disk.total and size > disk.free:  # some network file systems tell nothing
+    if disk.total and size > disk.free:  # some network file systems report zeros
         raise SceneError(
             f"{path}: needs {bytes_text(size)}, {bytes_text(disk.free)} are free there, so nothing "
             "was written; make room or name another place"
@@ -302,7 +297,7 @@ def require_space(path: Path, folder: Path, size: int) -> None:
 
 
 def bytes_text(size: float) -> str:
-    """A number of bytes in kB, MB or GB of 1000, to three digits.
+    """A number of bytes in kB, MB or GB (powers of 1000), with three digits.
 
     Example:
         >>> bytes_text(3_847), bytes_text(113_400_000), bytes_text(2.5e9)
@@ -315,7 +310,7 @@ def bytes_text(size: float) -> str:
 
 
 def three_digits(value: float) -> str:
-    """A positive number with the digits that matter: three, or all of a larger one.
+    """A positive number with three significant digits, or all digits of a larger integer part.
 
     Example:
         >>> three_digits(0.3964), three_digits(14.27), three_digits(9999.6)
@@ -326,8 +321,8 @@ def three_digits(value: float) -> str:
 
 
 def _mode_of(path: Path) -> int | None:
-    """Permission bits of a file that is to be replaced; None if there is none. Raises SceneError if
-    it is not regular."""
+    """Permission bits of a file to be replaced; None if it does not exist. Raises SceneError if it
+    is not a regular file."""
     try:
         status = path.lstat()
     except FileNotFoundError:
@@ -338,8 +333,7 @@ def _mode_of(path: Path) -> int | None:
 
 
 def json_text(content: Any) -> str:
-    """JSON of numbers, text, paths and collections of them, with null for numbers that JSON does
-    not have.
+    """JSON of numbers, text, paths and collections of them, with null for NaN and infinities.
 
     Example:
         >>> print(json_text({"psnr": float("inf"), "output": Path("room.ply")}))
@@ -352,7 +346,7 @@ def json_text(content: Any) -> str:
 
 
 def write_json(content: Any, path: Path | str) -> None:
-    """Write JSON as :func:`json_text` has it, as :func:`replacing` writes what no person named."""
+    """Write the JSON of :func:`json_text` to an automatically named file, see :func:`replacing`."""
     with replacing(path, named=False) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")
 
@@ -366,11 +360,10 @@ def _without_infinities(value: Any) -> Any:
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write rows of the same columns to a CSV file, as :func:`replacing` writes what no person
-    named.
+    """Write rows with the same columns to a CSV file, automatically named, see :func:`replacing`.
 
-    A text that spreadsheets would take for a formula, which may send what stands in other cells
-    (OWASP, CSV injection), gets a leading apostrophe: a file's name may be a stranger's.
+    Text that spreadsheets would run as a formula, which can send the content of other cells (OWASP,
+    CSV injection), gets a leading apostrophe, because file names are untrusted.
     """
     formula = tuple("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
     with (
@@ -393,7 +386,7 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 def write_tensors(
     path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str], named: bool = True
 ) -> None:
-    """Write tensors of any device and a header of metadata to a safetensors file, as
+    """Write tensors of any device and a metadata header to a safetensors file, as
     :func:`replacing` does."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
@@ -402,5 +395,5 @@ def write_tensors(
     with replacing(path, named=named) as part:
         try:
             save_file(contiguous, part, metadata=header)
-        except SafetensorError as error:  # for one, of a full disk
+        except SafetensorError as error:  # for example if the disk is full
             raise OSError(one_line(error)) from error

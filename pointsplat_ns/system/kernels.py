@@ -1,9 +1,8 @@
-"""Functions of the C++ files of this package: built when the package is installed, and called on
-several threads.
+"""Calls the package's C++ functions, which are compiled at installation, on several threads.
 
-Structs and functions are read from the files and their headers, so that nothing is declared twice.
-Files share what is between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs
-of numbers, arrays, pointers and earlier structs.
+Structs and functions are parsed from the C++ files and their headers, so that they are declared
+once. A file exports the code between ``extern "C" {`` and ``}  // extern "C"``: functions, and
+plain structs of numbers, arrays, pointers and earlier structs.
 """
 
 from __future__ import annotations
@@ -38,15 +37,15 @@ _NUMBERS = {
 
 
 class Pointer:
-    """Type of a pointer, which takes contiguous tensors on the CPU, of one dtype or of any,
-    structs, addresses and None."""
+    """Pointer type. Accepts contiguous CPU tensors, of one dtype or of any, structs, addresses and
+    None."""
 
     def __init__(self, dtype: torch.dtype | None):
         self.dtype = dtype
 
     def address(self, value: Any) -> int | None:
-        """The address of a tensor; None and addresses as they are. Raises TypeError if the tensor
-        has another dtype or device, or is not contiguous."""
+        """Address of a tensor; None and addresses are returned unchanged. Raises TypeError if the
+        tensor has another dtype or device, or is not contiguous."""
         if not isinstance(value, torch.Tensor):
             return value
         if self.dtype not in (None, value.dtype) or not value.is_cpu or not value.is_contiguous():
@@ -57,15 +56,15 @@ class Pointer:
         return value.data_ptr()
 
     def from_param(self, value: Any) -> Any:
-        """What ctypes passes for an argument."""
+        """Value that ctypes passes for an argument."""
         if value is None or isinstance(value, (int, torch.Tensor)):
             return ctypes.c_void_p(self.address(value))
         return ctypes.byref(value) if isinstance(value, Struct) else value
 
 
 class Struct(ctypes.Structure):
-    """A struct of a C++ file. :meth:`fill` sets pointers to what :class:`Pointer` takes, and keeps
-    tensors alive."""
+    """A struct of a C++ file. :meth:`fill` sets pointers to the values that :class:`Pointer`
+    accepts, and keeps references to tensors."""
 
     __slots__ = ("kept",)
     pointers: ClassVar[dict[str, Pointer]] = {}
@@ -75,8 +74,8 @@ class Struct(ctypes.Structure):
         self.fill(**values)
 
     def fill(self, **values: Any) -> None:
-        """Set fields. Raises AttributeError if there is no such field, and TypeError if a value
-        does not fit its type."""
+        """Set fields. Raises AttributeError for an unknown field, and TypeError for a value of the
+        wrong type."""
         self.kept.update(values)
         pointers = self.pointers
         for name, value in values.items():
@@ -84,8 +83,8 @@ class Struct(ctypes.Structure):
 
 
 def structs_of(text: str) -> dict[str, type[Struct]]:
-    """The structs that the text of a C++ file shares, by name. Raises ValueError if a field is of
-    an unknown type."""
+    """The structs that the text of a C++ file exports, by name. Raises ValueError if a field has an
+    unknown type."""
     found: dict[str, type[Struct]] = {}
     for name, body in re.findall(r"^struct (\w+) \{\n(.*?)^\};", _shared(text), re.M | re.S):
         declared = [
@@ -105,8 +104,8 @@ def structs_of(text: str) -> dict[str, type[Struct]]:
 
 
 def functions_of(text: str, structs: dict[str, type[Struct]]) -> dict[str, tuple[Any, list[Any]]]:
-    """Type of the result and types of the arguments of the functions that the text of a C++ file
-    shares, by name, given its structs. Raises ValueError if a type is unknown."""
+    """Result type and argument types of the functions that the text of a C++ file exports, by name,
+    given its structs. Raises ValueError if a type is unknown."""
     found = {}
     for result, name, parameters in re.findall(r"^(\w+) (\w+)\(([^)]*)\) \{", _shared(text), re.M):
         kinds = [
@@ -119,7 +118,7 @@ def functions_of(text: str, structs: dict[str, type[Struct]]) -> dict[str, tuple
 
 
 def _shared(text: str) -> str:
-    """What a C++ file shares, without comments."""
+    """The exported part of a C++ file, without comments."""
     return re.sub(
         r"//.*",
         "",
@@ -128,8 +127,7 @@ def _shared(text: str) -> str:
 
 
 def _declared(statement: str, structs: dict[str, type[Struct]]) -> list[tuple[str, Any]]:
-    """Names and types that a statement such as ``const float *a, b[3]`` declares; arrays are
-    flat."""
+    """Names and types in a declaration such as ``const float *a, b[3]``; arrays are flattened."""
     found: list[tuple[str, Any]] = []
     base, declarators = re.sub(r"^\s*(const )?", "", statement).split(None, 1)
     if base.endswith("*"):
@@ -154,15 +152,15 @@ def _declared(statement: str, structs: dict[str, type[Struct]]) -> list[tuple[st
 
 
 SEVERAL = 4000
-"""Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
+"""Gaussians, or pairs of Gaussian and tile, above which several threads are faster than one."""
 
 
 class Kernels:
-    """Functions of the C++ files that are faster than torch. All are used or none, because results
-    would else be rounded by the one here and by torch there.
+    """The compiled functions. Either all or none are used, because the kernels and torch round
+    differently.
 
     Args:
-        path: their library, which an installation builds.
+        path: the library, built at installation.
     """
 
     def __init__(self, path: Path):
@@ -174,12 +172,12 @@ class Kernels:
 
     @functools.cached_property
     def structs(self) -> dict[str, type[Struct]]:
-        """The structs that the functions take, by name."""
+        """The structs of the functions' parameters, by name."""
         return structs_of(self._text)
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
-        """The functions. Raises OSError if they were not built."""
+        """The loaded library. Raises OSError if it was not built."""
         library = ctypes.CDLL(str(self._path))
         for name, (result, parameters) in functions_of(self._text, self.structs).items():
             function = getattr(library, name)
@@ -189,14 +187,14 @@ class Kernels:
 
     @functools.cached_property
     def why_missing(self) -> str:
-        """The reason why this machine cannot use them; empty if it can."""
+        """Why this machine cannot use the kernels; empty if it can."""
         if IS_X86 and not torch.backends.cpu.get_cpu_capability().startswith("AVX"):  # AVX2 or more
-            why = "this processor, or ATEN_CPU_CAPABILITY, has no AVX2"
+            why = "AVX2 is missing in this processor, or disabled by ATEN_CPU_CAPABILITY"
         elif not self._path.is_file():
             others = any(self._path.parent.glob("kernels.*.so"))
-            found = "they were built from other sources" if others else "they were not built"
+            found = "built from other sources" if others else "not built"
             why = (
-                f"{found}; where there is a C++ compiler, installing builds them (in a clone: pip "
+                f"{found}; installing builds them if there is a C++ compiler (in a clone: pip "
                 "install -e .)"
             )
         else:
@@ -206,23 +204,25 @@ class Kernels:
             except OSError as error:
                 why = " ".join(str(error).split())
         logger.warning(
-            "compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", why
+            "no compiled kernels, using slower PyTorch code; results differ in the last digits: %s",
+            why,
         )
         return why
 
     def usable(self, wanted: bool | None) -> bool:
-        """Whether to use them: not if ``wanted`` is False. True warns where there are none."""
+        """Whether to use the kernels. False never does; True warns if they are missing."""
         if wanted is False:
             return False
         why = self.why_missing
         if why and wanted:
+            # Python shows each text once
             warnings.warn(
-                f"torch computes what kernels were asked for: {why}", stacklevel=1
-            )  # one text is shown once
+                f"compiled kernels are missing, using PyTorch instead: {why}", stacklevel=1
+            )
         return not why
 
     def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:
-        """Whether to use them for these tensors: float32, on a CPU; ``wanted`` as for
+        """Whether to use the kernels for these tensors: float32, on a CPU; ``wanted`` as for
         :meth:`usable`."""
         suited = all(
             tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors
@@ -234,11 +234,11 @@ KERNELS = Kernels(library_path())
 
 
 def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object) -> None:
-    """Call a function of a C++ file in :func:`~pointsplat_ns.system.threads.most_threads` threads,
-    or in one if more are not worth it.
+    """Call a C++ function on :func:`~pointsplat_ns.system.threads.most_threads` threads, or on one
+    if more are not ``worth_it``.
 
-    The last parameter of the function points to the number of pieces of work that threads have
-    taken. ctypes lets go of Python during the call.
+    The last parameter of the function points to a counter of the work items taken by threads.
+    ctypes releases the GIL during the call.
     """
     taken = ctypes.c_int64(0)
     call = functools.partial(function, *arguments, ctypes.byref(taken))
@@ -248,12 +248,12 @@ def on_threads(worth_it: bool, function: Callable[..., object], *arguments: obje
         try:
             for _ in range(threads - 1):
                 others.append(pool("kernel", os.cpu_count() or 1).submit(call))
-        except RuntimeError as error:  # no more threads are started: this one does the rest
-            ending = "shutdown" in str(error)  # else the system has a limit
+        except RuntimeError as error:  # cannot start more threads: this one does the rest
+            ending = "shutdown" in str(error)  # else the system's limit is reached
             if ending and threading.current_thread() is not threading.main_thread():
-                raise SystemExit from None  # ends one of a viewer, for which nobody waits
+                raise SystemExit from None  # ends a viewer's thread, for which nobody waits
         call()
     finally:
-        wait(others)  # they use the memory of the arguments, also where Ctrl-C ended the call here
+        wait(others)  # they use the arguments' memory, even if Ctrl-C ended the call here
     for other in others:
         other.result()

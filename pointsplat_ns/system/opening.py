@@ -1,4 +1,4 @@
-"""Opens files for reading. All files that may be a stranger's are opened here."""
+"""Opens files for reading. All untrusted files are opened here."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import BinaryIO
 
 
 def open_regular(path: Path | str) -> BinaryIO:
-    """Open a regular file to read its bytes. Pipes, sockets and devices may have no end, or wait
-    for ever, and are not opened.
+    """Open a regular file to read its bytes. Pipes, sockets and devices are refused, because they
+    may block or never end.
 
     Raises:
-        OSError: if the file is missing, not a regular one, or cannot be read.
+        OSError: if the file is missing, not a regular file, or cannot be read.
     """
     path = os.fspath(path)
     _need_regular(path, os.stat(path))
-    # Another file may have taken the name since then: a pipe is then opened without waiting.
+    # If another file took the name meanwhile, opening a pipe must not block.
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     descriptor = os.open(path, flags)
     try:

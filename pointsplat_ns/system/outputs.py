@@ -1,9 +1,8 @@
-"""Names of outputs: a command claims them while it works, and takes them at its end only if they are
-still free.
+"""Output names: a command claims them while it works, and writes them only if they are still free.
 
-A claim is a lock on a hidden file beside the output. It refuses a second command early, and is no
-promise: a claim that cannot be made is left out, and one that a killed command left is taken over.
-What holds always is the last step, which never replaces a file that has appeared meanwhile.
+A claim is a lock on a hidden file beside the output. It refuses a second command early, but gives
+no guarantee: if a claim cannot be made, it is skipped, and the claim of a killed command is taken
+over. The guarantee is the last step, which never replaces a file that appeared meanwhile.
 """
 
 from __future__ import annotations
@@ -27,17 +26,17 @@ from pointsplat_ns.errors import SceneError
 
 @dataclass
 class _Claim:
-    """A name that one command writes."""
+    """A claimed output name."""
 
     lock: int | None = None
     """Descriptor of the locked file; None without a lock."""
     file: Path | None = None
     """The locked file."""
     folders: list[Path] = field(default_factory=list)
-    """Folders that were made for it, the outermost first."""
+    """Folders created for it, outermost first."""
 
     def release(self) -> None:
-        """Give the name back. Folders that were made for it stay."""
+        """Release the name. Folders created for it stay."""
         if self.lock is not None and self.file is not None:
             with suppress(OSError):
                 self.file.unlink()
@@ -50,9 +49,9 @@ class _Outputs:
     """The outputs of one command."""
 
     claims: dict[str, _Claim] = field(default_factory=dict)
-    """By absolute path, the names that were free when the command began."""
+    """Names that were free when the command began, by absolute path."""
     unnamed: set[str] = field(default_factory=set)
-    """Absolute paths that the program chose."""
+    """Automatically named files, absolute paths."""
 
 
 _outputs: ContextVar[_Outputs | None] = ContextVar("outputs", default=None)
@@ -60,8 +59,8 @@ _outputs: ContextVar[_Outputs | None] = ContextVar("outputs", default=None)
 
 @contextmanager
 def outputs_claimed() -> Iterator[None]:
-    """While this is open, names that :func:`claim` was called with are those of this command. Where
-    one is open already, nothing changes."""
+    """Inside of this context, :func:`claim` claims names for this command. A nested context changes
+    nothing."""
     if _outputs.get() is not None:
         yield
         return
@@ -78,8 +77,8 @@ def outputs_claimed() -> Iterator[None]:
 
 
 def claim(path: Path) -> None:
-    """Claim a name for this command until its :func:`outputs_claimed` is closed; nothing happens if
-    none is open. Raises SceneError if another command of this machine has claimed it."""
+    """Claim a name for this command until its :func:`outputs_claimed` context ends; no effect
+    outside of one. Raises SceneError if another command on this machine has claimed it."""
     outputs = _outputs.get()
     key = os.path.abspath(path)
     if outputs is None or key in outputs.claims:
@@ -93,21 +92,21 @@ def claim(path: Path) -> None:
 
 
 def is_claimed(path: Path) -> bool:
-    """Whether this command claimed a name, and has not written it yet."""
+    """Whether this command has claimed a name and not written it yet."""
     outputs = _outputs.get()
     return outputs is not None and os.path.abspath(path) in outputs.claims
 
 
 def written(path: Path) -> None:
-    """Give back the claim on a name: the file is there, and may be replaced by this command."""
+    """Release the claim on a name: the file exists, and this command may replace it."""
     outputs = _outputs.get()
     if outputs is not None and (one := outputs.claims.pop(os.path.abspath(path), None)):
         one.release()
 
 
 def unnamed(path: Path) -> Path:
-    """``path``, after it was noted for this command that nobody named it: a symbolic link there is
-    a stranger's."""
+    """Mark ``path`` as automatically named in this command, and return it. A symbolic link there is
+    untrusted."""
     outputs = _outputs.get()
     if outputs is not None:
         outputs.unnamed.add(os.path.abspath(path))
@@ -115,14 +114,14 @@ def unnamed(path: Path) -> Path:
 
 
 def is_unnamed(path: Path) -> bool:
-    """Whether :func:`unnamed` was called with this path in this command."""
+    """Whether this command marked the path with :func:`unnamed`."""
     outputs = _outputs.get()
     return outputs is not None and os.path.abspath(path) in outputs.unnamed
 
 
 def is_own_file(path: Path) -> bool:
-    """Whether there is a regular file, and no symbolic link to one: what nobody named is not read
-    through a link."""
+    """Whether the path is a regular file, not a link to one: automatically named files are not read
+    through links."""
     try:
         return stat.S_ISREG(path.lstat().st_mode)
     except OSError:
@@ -130,15 +129,15 @@ def is_own_file(path: Path) -> bool:
 
 
 def remove_own(path: Path) -> None:
-    """Remove a file that a command left, or a symbolic link in its place; what else is there, such
-    as a folder, stays."""
+    """Remove a file that a command left, or a symbolic link in its place; anything else, such as a
+    folder, stays."""
     with suppress(OSError):
         path.unlink()
 
 
 def need_no_links(folder: Path, path: Path) -> None:
-    """Raise a SceneError if a folder between ``folder`` and ``path``, which lies below it, is a
-    symbolic link: nobody named it."""
+    """Raise a SceneError if a folder between ``folder`` and ``path`` below it is a symbolic link,
+    because the user did not name it."""
     for place in path.parents:
         if place == folder:
             return
@@ -150,30 +149,29 @@ def need_no_links(folder: Path, path: Path) -> None:
 
 
 def short_name(path: Path) -> str:
-    """The name of a path, cut so that a hidden name can be made of it: file systems allow 255
-    bytes."""
+    """Name of a path, cut so that a hidden name derived from it stays below the file system's limit
+    of 255 bytes."""
     return path.name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
 
 
 def make_folders(folder: Path) -> list[Path]:
-    """Make a folder and those above it; returns those that were missing, the outermost first.
-    Raises OSError if one cannot be made."""
+    """Create a folder and its missing parents; returns the created folders, outermost first. Raises
+    OSError if one cannot be created."""
     missing = [place for place in (folder, *folder.parents) if not os.path.lexists(place)][::-1]
     folder.mkdir(parents=True, exist_ok=True)
     return missing
 
 
 def remove_empty(folders: list[Path]) -> None:
-    """Remove those of some folders that are empty; ``folders`` as of :func:`make_folders`."""
+    """Remove the empty ones of the folders that :func:`make_folders` returned."""
     for folder in reversed(folders):
         with suppress(OSError):
             folder.rmdir()
 
 
 def put_new(part: Path, target: Path) -> None:
-    """Give a finished file its name, in one step, unless there is something of this name. The
-    temporary name may stay. Raises FileExistsError if there is, and OSError if it cannot be
-    done."""
+    """Move a finished file to its name atomically, unless the name is taken. The temporary name may
+    remain. Raises FileExistsError if the name is taken, and OSError if moving fails."""
     try:
         os.link(part, target)
     except FileExistsError:
@@ -189,33 +187,33 @@ def put_new(part: Path, target: Path) -> None:
 
 
 def appeared(path: Path) -> SceneError:
-    """The error for a name that was free when the command began, and is not now."""
+    """The error for a name that was free when the command began, and is taken now."""
     return SceneError(
-        f"{path}: another file of this name has appeared meanwhile, and stays; name another one, "
-        "or overwrite it with --force"
+        f"{path}: another file of this name appeared meanwhile; it is not replaced; choose another "
+        "name, or overwrite it with --force"
     )
 
 
 def put_folder(part: Path, target: Path, last: str, ours: str, force: bool) -> None:
-    """Give a finished folder its name, or its files their place in a folder that is there.
+    """Move a finished folder to its name, or its files into an existing folder.
 
-    A folder that holds nothing else than files of ours is replaced in one step, where the system
-    can exchange two names (Linux, macOS). Otherwise entries are replaced one by one, ``last`` at
-    the end, and an error or a signal puts back what was there.
+    An existing folder that contains only our files is replaced in one step, if the system can
+    exchange two names (Linux, macOS). Otherwise entries are replaced one by one, ``last`` at the
+    end, and an error or a signal restores the previous entries.
 
     Args:
-        part: the finished folder, beside ``target``; what was replaced is in it afterwards.
-        target: no symbolic link.
-        last: the entry that tells of all others.
-        ours: pattern of the names of entries that may be replaced or removed.
-        force: whether entries may be replaced.
+        part: the finished folder, beside ``target``; receives the replaced entries.
+        target: not a symbolic link.
+        last: the index file.
+        ours: pattern of the entry names that may be replaced or removed.
+        force: whether to replace entries.
 
     Raises:
-        FileExistsError: if there is an entry that may not be replaced.
+        FileExistsError: if an entry exists that may not be replaced.
         OSError: if files cannot be renamed.
     """
     if not os.path.lexists(target):
-        with suppress(OSError):  # something has appeared after all
+        with suppress(OSError):  # the name was taken meanwhile
             os.rename(part, target)
             return
     found = os.listdir(target)
@@ -230,12 +228,12 @@ def put_folder(part: Path, target: Path, last: str, ours: str, force: bool) -> N
 
 
 def _put_entries(part: Path, target: Path, last: str, force: bool) -> None:
-    """Put the entries of a folder into another one, ``last`` at the end, or none."""
+    """Move all entries of a folder into another one, ``last`` at the end, or none."""
     names = sorted(os.listdir(part), key=lambda name: (name == last, name))
     aside = part / f".{secrets.token_hex(4)}"
     aside.mkdir()
     try:
-        if force:  # without the last one nobody takes the others for whole
+        if force:  # without the index file, the others are not taken as complete
             _rename_present(target / last, aside / last)
         for name in names:
             if force:
@@ -243,7 +241,7 @@ def _put_entries(part: Path, target: Path, last: str, force: bool) -> None:
                 os.rename(part / name, target / name)
             else:
                 _put_entry(part / name, target / name)
-    except BaseException:  # the interrupted step may have been taken or not
+    except BaseException:  # the interrupted step may be done or not
         for name in reversed(names):
             with suppress(OSError):
                 if not os.path.lexists(part / name):
@@ -257,13 +255,13 @@ def _put_entries(part: Path, target: Path, last: str, force: bool) -> None:
 
 
 def _rename_present(path: Path, other: Path) -> None:
-    """Rename what is there, if anything is."""
+    """Rename a path if it exists."""
     if os.path.lexists(path):
         os.rename(path, other)
 
 
 def _put_entry(part: Path, target: Path) -> None:
-    """Give a file or a folder its name. Raises FileExistsError if there is something."""
+    """Move a file or a folder to its name. Raises FileExistsError if the name is taken."""
     try:
         if os.path.lexists(target):
             raise FileExistsError
@@ -278,8 +276,8 @@ def _put_entry(part: Path, target: Path) -> None:
 
 
 def _exchanged(first: Path, second: Path) -> bool:
-    """Whether two folders have exchanged their names, in one step; False where the system or the
-    file system cannot."""
+    """Exchange the names of two folders in one step; False if the system or the file system cannot
+    do it."""
     names = os.fsencode(first), os.fsencode(second)
     exchange = 2  # RENAME_EXCHANGE of Linux, RENAME_SWAP of macOS
     try:
@@ -295,9 +293,8 @@ def _exchanged(first: Path, second: Path) -> bool:
 
 
 def _locked(file: Path, path: Path) -> int | None:
-    """A descriptor of a file that is made if it is missing and locked until it is closed; None if
-    that is not possible here. Raises SceneError, about ``path``, if another process has locked
-    it."""
+    """Descriptor of a file, created if missing, and locked until it is closed; None if locking is
+    not possible here. Raises SceneError about ``path`` if another process holds the lock."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -312,9 +309,9 @@ def _locked(file: Path, path: Path) -> int | None:
         except BlockingIOError as error:
             os.close(number)
             raise SceneError(
-                f"{path}: another command is writing it; name another one, or wait for its end"
+                f"{path}: another command is writing it; choose another name, or wait for its end"
             ) from error
-        except FileNotFoundError:  # the command that had it has ended just now
+        except FileNotFoundError:  # the command that held it has just ended
             pass
         except OSError:  # a file system without locks
             os.close(number)
@@ -325,8 +322,8 @@ def _locked(file: Path, path: Path) -> int | None:
 
 @contextmanager
 def temporary_folder(target: Path) -> Iterator[Path]:
-    """A new hidden folder beside ``target``, removed at the end, with folders above that were made
-    for it if they are empty then. Raises OSError if it cannot be made."""
+    """A new hidden folder beside ``target``, removed at the end together with the parent folders
+    created for it that are empty. Raises OSError if it cannot be created."""
     made = make_folders(target.parent)
     part = target.parent / f".{short_name(target)}.{os.getpid()}-{secrets.token_hex(4)}.part"
     try:

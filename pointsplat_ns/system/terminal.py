@@ -23,9 +23,9 @@ def print_table(
     left: Collection[int] = (0,),
     section: int = 0,
 ) -> None:
-    """Print a table. Columns whose number is in ``left`` are aligned left and may be folded; others
-    are aligned right. A line follows each ``section`` rows. Where there is no terminal, the table
-    is as wide as it needs to be."""
+    """Print a table. Columns whose index is in ``left`` are left-aligned and may wrap; others are
+    right-aligned. A line follows each ``section`` rows. Without a terminal, the table is as wide as
+    its content."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

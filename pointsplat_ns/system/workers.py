@@ -1,4 +1,4 @@
-"""Work that several processes of this machine share, by :mod:`concurrent.futures`."""
+"""Distributes work over several processes of this machine, with :mod:`concurrent.futures`."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ Result = TypeVar("Result")
 
 
 class Workers(Generic[Item, Result]):
-    """Processes that call a function with one item after the other, and share the cores. With one
-    job, this process does. When the context is left, or this process ends, the others end at once,
-    whatever they do.
+    """Processes that call a function for items and share the cores. With one job, the current
+    process does the work. When the context or this process ends, the others end at once.
 
     Args:
-        function: pickled once for each process.
+        function: pickled once per process.
         jobs: number of processes.
     """
 
@@ -40,23 +39,21 @@ class Workers(Generic[Item, Result]):
         if self._jobs > 1:
             context = get_context("spawn")
             ends, self._held = context.Pipe(duplex=False)
-            function = pickle.dumps(
-                self._function
-            )  # by multiprocessing, tensors would be moved to shared memory
-            with _started_safely(
-                self._jobs
-            ):  # a pool starts multiprocessing's tracker of resources
+            # multiprocessing would move tensors to shared memory
+            function = pickle.dumps(self._function)
+            # a pool starts multiprocessing's resource tracker
+            with _started_safely(self._jobs):
                 self._pool = ProcessPoolExecutor(self._jobs, context, _begin, (ends, function))
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._jobs > 1:
-            self._held.close()  # which all processes notice
+            self._held.close()  # all processes notice this
             self._pool.shutdown(cancel_futures=True)
 
     def results(self, items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
-        """Each item with its result, in the order in which they are made. Raises what the function
-        raises, and PointSplatError if a process is killed."""
+        """Each item with its result, in order of completion. Raises the exceptions of the function,
+        and PointSplatError if a process is killed."""
         if self._jobs == 1:
             for item in items:
                 yield item, self._function(item)
@@ -68,23 +65,23 @@ class Workers(Generic[Item, Result]):
                 yield futures[future], future.result()
         except BrokenProcessPool as error:
             raise PointSplatError(
-                "a process was killed, as happens where memory is short; the same command resumes, "
-                "with fewer --jobs if need be"
+                "a process was killed, probably because memory ran out; run the same command to "
+                "resume, with fewer --jobs if needed"
             ) from error
 
 
 def check_jobs(jobs: int) -> None:
-    """Raise a DataError if a number of processes is not positive."""
+    """Raise a DataError if the number of processes is not positive."""
     if jobs < 1:
         raise DataError(f"jobs is {jobs}; expected 1 or more")
 
 
 _function: Callable[[], Callable[[Any], Any]]
-"""In a process of :class:`Workers`: gives its function."""
+"""The function, in a process of :class:`Workers`."""
 
 
 def _begin(ends: connection.Connection, function: bytes) -> None:
-    """The start of a process, which ends with the one that started it. Ctrl-C is for that one."""
+    """Initialise a process: it ends with its parent, and leaves Ctrl-C to the parent."""
     global _function
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(ends,), daemon=True).start()
@@ -96,7 +93,7 @@ def _call(item: Any) -> Any:
 
 
 def _end_with(ends: connection.Connection) -> None:
-    """End this process, whatever it does, when the other end of a pipe is closed."""
+    """End this process at once when the other end of a pipe is closed."""
     connection.wait([ends])
     os._exit(1)
 
@@ -106,13 +103,13 @@ _starting = threading.Lock()
 
 @contextmanager
 def _started_safely(jobs: int) -> Iterator[None]:
-    """Let processes that are started while the context is open have no Ctrl-C, not the current
-    folder on their path, and as many threads each as the environment variable ``OMP_NUM_THREADS``
-    says, else their share of the cores.
+    """Inside of this context, child processes ignore Ctrl-C, do not have the current folder on
+    their path, and use as many threads as the environment variable ``OMP_NUM_THREADS`` says, or
+    else their share of the cores.
 
     multiprocessing starts them and its resource tracker with ``python -c``, which puts the current
-    folder first on the path: what lies beside the scenes would be imported in place of Python's own
-    modules. Python 3.10 has no option against it. Ctrl-C would show a traceback of each process
+    folder first on the path: files beside the scenes would be imported in place of Python's own
+    modules. Python 3.10 has no option against it. Ctrl-C would print a traceback of each process
     that is still importing.
     """
 

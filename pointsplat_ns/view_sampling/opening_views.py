@@ -1,10 +1,8 @@
-"""The views in which people see a scene first: its subject whole and upright, or from where people
-stood.
+"""The first views that a viewer shows: the whole subject, upright, or places where people stood.
 
-A person who opens a scene wants one picture that shows what it is, and then others. An object is
-shown whole: people are as likely to take a picture of all of it
-(:mod:`~pointsplat_ns.view_sampling.sampler`) as others. In a room or outdoors, where nobody stands
-outside of everything, they are not.
+A viewer opens with one image that shows the whole subject, followed by others. An object is shown
+whole: photos of all of it are as likely as others (:mod:`~pointsplat_ns.view_sampling.sampler`). In
+a room or outdoors, where no camera stands outside of everything, they are not.
 """
 
 from __future__ import annotations
@@ -23,13 +21,13 @@ from pointsplat_ns.view_sampling.upright import Up
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """The views in which people see a scene first."""
+    """The first views that a viewer shows."""
 
     views: Views
-    """The first is the one that a viewer opens with."""
+    """The first is the opening view."""
     up: Up
     whole: bool
-    """Whether the first view shows all of the scene from outside: an object to circle around, no
+    """Whether the opening view shows the whole scene from outside: an object to orbit, not a
     room."""
 
 
@@ -42,20 +40,19 @@ def opening_views(
     up: Up | None = None,
     known: Views | None = None,
 ) -> Opening:
-    """The views in which to show a scene first.
+    """The first views of a scene to show.
 
-    If a view from around the scene, which shows all of it, is at least as likely as half of the
-    known views, or of sampled ones, it comes first, and others of its kind or known ones follow.
-    Else known or sampled views come, the likeliest first. Views complete each other.
+    If a view from outside, which shows all of the scene, is at least as likely as half of the known
+    or sampled views, it comes first, followed by others of its kind or known ones. Otherwise known
+    or sampled views follow, likeliest first. Views complement each other.
 
     Args:
         scene: N Gaussians.
-        count: number of views, at least 1; fewer are returned where there are no more.
-        width: of the pictures, pixels, if the views are not known ones.
-        height: of the pictures, pixels.
-        up: which way is up; by default what the scene declares, or estimated.
-        known: views that people took or chose. Their size, background and rasterize mode apply to
-            all views.
+        count: number of views, at least 1; fewer are returned if there are no more.
+        width: of the images, pixels, unless the views are known ones.
+        height: of the images, pixels.
+        up: up direction; by default declared by the scene, or estimated.
+        known: views chosen by people. Their size, background and rasterize mode apply to all views.
 
     Raises:
         DataError: if nothing of the scene is visible.

@@ -1,4 +1,4 @@
-"""Cameras at given places, from which sampled views are made."""
+"""Cameras at given positions, the basis of sampled views."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Ten
 
     Args:
         positions: (C, 3) of the cameras.
-        targets: (C, 3); where a target is at its camera's position, the camera looks along x.
-        up: (3,) direction that is up in the pictures, of any length; by default z. Cameras that
-            look along it have another direction up.
+        targets: (C, 3); if a target is at its camera's position, the camera looks along x.
+        up: (3,) up direction of the images, of any length; by default z. Cameras that look along it
+            get another up direction.
 
     Returns:
         (C, 4, 4), OpenCV axes.
@@ -47,13 +47,13 @@ def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Ten
 
 
 def views_of(viewmats: Tensor, width: int, height: int, diagonal: float) -> Views:
-    """Views over black from world-to-camera matrices.
+    """Views with a black background from world-to-camera matrices.
 
     Args:
         viewmats: (C, 4, 4).
-        width, height: size of the pictures, pixels.
-        diagonal: of the content, in the unit of ``viewmats``; the near plane is a thousandth of it
-            away.
+        width, height: size of the images, pixels.
+        diagonal: of the content, in the unit of ``viewmats``; the near plane is at a thousandth of
+            it.
     """
     focal = 0.5 * max(width, height) / math.tan(math.radians(looking().field_of_view) / 2)
     K = viewmats.new_tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
@@ -62,7 +62,7 @@ def views_of(viewmats: Tensor, width: int, height: int, diagonal: float) -> View
 
 
 def level_directions(up: Tensor, turn: Tensor) -> Tensor:
-    """Directions (n, 3) at a right angle to ``up`` (3,), at angles (n,) around it, radians."""
+    """Directions (n, 3) perpendicular to ``up`` (3,), at angles (n,) around it, radians."""
     right = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype, device="cpu")[up.abs().argmin()])
     right = right / right.norm()
     return turn.cos()[:, None] * right + turn.sin()[:, None] * torch.linalg.cross(up, right)
@@ -71,26 +71,25 @@ def level_directions(up: Tensor, turn: Tensor) -> Tensor:
 def whole_views(
     points: Tensor, up: Tensor, turns: Tensor, elevation: float, width: int, height: int
 ) -> Views:
-    """Views from around the content, each as near as the whole of it allows; float64, units.
+    """Views around the content, each as near as possible with all of it in view; float64, units.
 
     Args:
         points: (M, 3) of the content, units.
-        up: (3,) direction that is up, of length 1.
-        turns: (n,) angles of the cameras around it, radians.
+        up: (3,) up direction, unit length.
+        turns: (n,) azimuths of the cameras, radians.
         elevation: of the cameras above the content, degrees.
-        width, height: size of the pictures, pixels.
+        width, height: size of the images, pixels.
     """
-    level = torch.stack(
-        [*level_directions(up, up.new_tensor([0.0, math.pi / 2])), up]
-    )  # [3, 3] rows
-    quantiles = points.new_tensor([0.005, 0.995])  # what lies beyond is no part of the subject
+    # [3, 3] rows
+    level = torch.stack([*level_directions(up, up.new_tensor([0.0, math.pi / 2])), up])
+    quantiles = points.new_tensor([0.005, 0.995])  # points outside are not part of the subject
     middle = (points @ level.T).quantile(quantiles, dim=0).mean(0) @ level
     lift = math.radians(elevation)
     sides = math.cos(lift) * level_directions(up, turns.to(up)) + math.sin(lift) * up
     viewmats = look_at(sides, torch.zeros_like(sides), up)
     x, y, z = (viewmats[:, :3, :3] @ (points - middle).T).unbind(1)  # [n, M]
     reach = math.tan(math.radians(looking().field_of_view) / 2) / max(width, height)
-    # largest shares of the picture's width and height that the subject takes
+    # maximum shares of the image's width and height that the subject fills
     across = 0.92
     along = 0.88
     needed = (
@@ -102,5 +101,5 @@ def whole_views(
 
 
 def around(count: int) -> Tensor:
-    """Angles (count,) all around, radians."""
+    """Angles (count,) evenly spaced on a full circle, radians."""
     return torch.arange(count, **FLOATS) * (2 * math.pi / count)

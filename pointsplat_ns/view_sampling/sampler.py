@@ -1,20 +1,20 @@
-"""Samples views of a scene that comes without cameras: such as people may have taken photos from.
+"""Samples views of a scene without cameras, similar to those of its photos.
 
-Training spends Gaussians on what photos show, makes them as small as photos show them, and leaves
-nothing to see where no photo looked. So a view is likely if its picture is full and shows many
-Gaussians, all of them small. SH tell more: they explain best the places that photos were taken from
-(:mod:`~pointsplat_ns.view_sampling.traces`). The logarithm of the likelihood, up to a constant, is
+Training spends Gaussians on content of photos, makes them as small as photos show them, and leaves
+regions without photos empty. So a view is likely if its image is full and shows many Gaussians, all
+of them small. SH give more evidence: they are explained best by the true photo places
+(:mod:`~pointsplat_ns.view_sampling.traces`). The log-likelihood, up to a constant, is
 
     log(shown) - log(empty + 0.01) - 2 log(blur) + 0.75 evidence - (pitch + 15)^2 / (2 25^2)
 
-with the share of the Gaussians that are shown, the share of the picture that is empty, the mean
-over the picture of the angle that a Gaussian subtends, radians, the evidence of SH for its place,
-and its pitch, degrees: few photos look far up or down. A logistic regression between the poses of
-six captures and candidates gives 1.2, 1.3 and 0.75 without blur and pitch: with each capture left
-out in turn, a pose of it is likelier than a candidate in 89 % of cases. Blur tells poses from
-candidates no better; views from within walls, which captures lack, need it. Candidates whose pitch
-is bound to -50 to 10 degrees instead lose 0.2 dB on average over the six at 10 %, most where the
-estimated up is wrong. ``docs/concepts/sampled_views.md`` says more.
+where shown is the share of Gaussians that are visible, empty the share of the image that is empty,
+blur the mean over the image of the angle that a Gaussian subtends, radians, evidence that of SH for
+its place, and pitch is in degrees: few photos look far up or down. A logistic regression between
+the poses of six captures and candidates gives 1.2, 1.3 and 0.75 without blur and pitch: in
+leave-one-out tests, a capture's pose is likelier than a candidate in 89 % of cases. Blur does not
+separate poses from candidates any better, but is needed for views from within walls, which captures
+lack. Limiting the pitch of candidates to -50 to 10 degrees instead loses 0.2 dB on average over the
+six at 10 %, most if the estimated up direction is wrong. See ``docs/concepts/sampled_views.md``.
 """
 
 from __future__ import annotations
@@ -58,26 +58,26 @@ def sample_views(
     seed: int = 0,
     up: Tensor | None = None,
 ) -> Views:
-    """Sample cameras that look at a scene as people may have when they took its photos.
+    """Sample cameras similar to those of a scene's photos.
 
-    Candidates look at Gaussians at random, from distances at which these are small, or from places
-    where SH suggest that photos were taken. Of the likely ones
-    (:mod:`pointsplat_ns.view_sampling.sampler`), the next view is always the one that shows most of what
-    earlier views do not show. Views complete each other, so ask for all of them at once.
+    Candidates look at random Gaussians, from distances at which these are small, or from places
+    where SH suggest that photos were taken. Among likely ones
+    (:mod:`pointsplat_ns.view_sampling.sampler`), the next view is the one that adds most to the
+    earlier views. Views complement each other, so request all of them at once.
 
     Args:
         scene: N Gaussians.
         count: number of views, at least 1.
         width: of the images, pixels.
         height: of the images, pixels. The field of view is 70 degrees across the longer side.
-        seed: the same scene and seed give the same views, another seed gives others.
-        up: (3,) direction that is up in the world, of any length; by default the scene's own, or
+        seed: the same scene and seed give the same views; another seed gives others.
+        up: (3,) up direction in the world, of any length; by default declared by the scene, or
             estimated (:mod:`pointsplat_ns.view_sampling.upright`).
 
     Returns:
-        ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in
-        OpenCV axes and ``Ks`` (count, 3, 3) in pixels, float64, with a near plane that suits the
-        scene's size.
+        ``count`` views, on the CPU, with a black background: ``viewmats`` (count, 4, 4)
+        world-to-camera in OpenCV axes and ``Ks`` (count, 3, 3) in pixels, float64, with a near
+        plane that suits the scene's size.
 
     Raises:
         DataError: if ``count`` or the size is not positive, ``up`` is not a direction, or nothing
@@ -100,19 +100,19 @@ def sample_views(
 
 
 class Sampler:
-    """Samples views of a scene as :func:`sample_views` does. What all views have in common is found
+    """Samples views of a scene as :func:`sample_views` does. Data shared by all views is computed
     once.
 
     Args:
-        scene: N Gaussians. A large one is thinned.
+        scene: N Gaussians. A large scene is thinned.
         resolution: width and height of the views, pixels.
-        up: which way is up; by default the axis that the scene declares, or estimated.
-        stands_for: number of Gaussians of a larger scene for each, which was enlarged by that
-            (:func:`enlarged`).
+        up: up direction; by default declared by the scene, or estimated.
+        stands_for: number of Gaussians of a larger scene that each one represents; they were
+            enlarged by this factor (:func:`enlarged`).
 
     Raises:
-        DataError: if the resolution is not positive; and by attributes and methods, if nothing of
-            the scene is visible.
+        DataError: if the resolution is not positive; from attributes and methods, if nothing of the
+            scene is visible.
     """
 
     def __init__(
@@ -124,12 +124,11 @@ class Sampler:
     ):
         if min(resolution) < 1:
             raise DataError(
-                f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least "
-                "1 x 1"
+                f"cannot sample views of {resolution[0]} x {resolution[1]} pixels; expected at "
+                "least 1 x 1"
             )
-        self.scene = thinned(scene.detach(), looking().sampled_count).to(
-            "cpu"
-        )  # many small operations
+        # many small operations
+        self.scene = thinned(scene.detach(), looking().sampled_count).to("cpu")
         self._step = stands_for * thinning(len(scene), looking().sampled_count)
         self.resolution = resolution
         self._up = known_up(up, scene)
@@ -141,16 +140,16 @@ class Sampler:
 
     @cached_property
     def _in_units(self) -> Gaussians:
-        """The Gaussians that can be drawn, in units of the content, as is all that follows."""
+        """The drawable Gaussians in units of the content; all other attributes are in units."""
         scene = in_units(self.scene, *self.content)
         scene = scene[scene.usable()]
         if not bool((scene.alphas > 0).any()):
-            raise DataError("nothing of the scene can be seen, so there is no place to look from")
+            raise DataError("nothing of the scene is visible, so no view can be sampled")
         return scene
 
     @cached_property
     def surface(self) -> Surface:
-        """Points of what can be seen."""
+        """Points on the visible surfaces."""
         return Surface.of(self._in_units)
 
     @cached_property
@@ -159,52 +158,51 @@ class Sampler:
 
     @property
     def traced(self) -> bool:
-        """Whether SH tell where the scene's photos were taken, so that trace factors count."""
+        """Whether SH show where the scene's photos were taken, so that trace factors apply."""
         return self._traces.has_sh and self._traces.sure
 
     @cached_property
     def up(self) -> Up:
-        """Which way is up."""
-        few = thinned(
-            self._in_units, 20_000
-        )  # with half as many, a published room stands on its head
+        """Up direction."""
+        # with half as many, a published room is upside down
+        few = thinned(self._in_units, 20_000)
         return self._up or upright(few, self.surface, self._traces.sure)
 
     @cached_property
     def few(self) -> Gaussians:
-        """Some of the Gaussians, enlarged to cover as much as all, each beside its neighbours."""
+        """A selection of Gaussians, enlarged to cover as much as all, with neighbours together."""
         few = thinned(self._in_units, looking().candidate_gaussians)
         return few[curve_keys(unit_cells(few.means)).argsort(stable=True)]
 
     @cached_property
     def _log_widths(self) -> Tensor:
-        """Logarithms (n,) of the widths of :attr:`few` before they were enlarged, float64."""
+        """Logarithms (n,) of the widths of :attr:`few` before enlarging, float64."""
         step = self._step * thinning(len(self._in_units), looking().candidate_gaussians)
         return log_widths(self.few.scales) - 0.5 * math.log(step)
 
     @cached_property
     def _targets(self) -> Tensor:
-        """Indices (t,) of those of :attr:`few` that are opaque enough to be looked at."""
+        """Indices (t,) of the Gaussians in :attr:`few` that are opaque enough as targets."""
         alphas = self.few.alphas
         return (alphas > min(looking().min_opacity, 0.5 * float(alphas.max()))).nonzero()[:, 0]
 
     @cached_property
     def _floor(self) -> float:
-        """Height below which no camera stands."""
+        """Minimum height of cameras."""
         return float((self.few.means[self._targets].double() @ self.up.direction).quantile(0.05))
 
     def prepare(self) -> None:
-        """Find what all views have in common, if anything of the scene is visible."""
+        """Compute the data shared by all views, if anything of the scene is visible."""
         with contextlib.suppress(DataError):
             _ = self.up, self._log_widths
 
     @torch.no_grad()
     def views(self, count: int, seed: int = 0, likeliest: bool = False) -> Views:
         """``count`` views on the CPU. ``count``, ``seed`` and errors are those of
-        :func:`sample_views`. Views complete each other, or are the likeliest, which may show the
-        same."""
+        :func:`sample_views`. Views complement each other, or are the likeliest ones, which may
+        show the same content."""
         if count < 1:
-            raise DataError(f"{count} views asked for; expected at least 1")
+            raise DataError(f"cannot sample {count} views; expected at least 1")
         generator = torch.Generator().manual_seed(seed)
         drawn = self._drawn(
             max(looking().min_candidates, looking().candidates_per_view * count), generator
@@ -219,8 +217,8 @@ class Sampler:
         return in_scene_units(candidates[taken], *self.content)
 
     def judged(self, views: Views) -> tuple[Tensor, Tensor]:
-        """Logarithms (V,) of the likelihood of views in units of the content, up to a constant,
-        float64, and which of the Gaussians :attr:`few` each shows (V, n), bool."""
+        """Log-likelihoods (V,) of views in units of the content, up to a constant, float64, and a
+        mask (V, n) of the Gaussians :attr:`few` that each view shows."""
         viewmats = views.viewmats.double()
         eyes = invert_rigid(viewmats)[:, :3, 3]
         small = replace(views.resized(looking().candidate_side), rasterize_mode="antialiased")
@@ -230,10 +228,10 @@ class Sampler:
             pixels = pixels_of(self.few, small[index])
             covered = float(pixels.double().sum())
             distances = (self.few.means - eyes[index].float()).norm(dim=1).clamp_min(1e-3)
-            blur = 1.0  # radian, of a view that shows nothing
+            blur = 1.0  # radian, for an empty view
             if covered > 0:
                 blur = max(float((pixels * widths / distances).double().sum()) / covered, 1e-9)
-            shown = pixels > 0.02  # sum of blend weights
+            shown = pixels > 0.02  # sum of blending weights
             share = (float(shown.sum()) + 1) / len(pixels)
             empty = max(0.0, 1 - covered / (small.width * small.height))
             return math.log(share) - math.log(empty + 0.01) - 2 * math.log(blur), shown
@@ -248,8 +246,8 @@ class Sampler:
         return torch.tensor(likelihoods, **DOUBLES) + 0.75 * evidence + usual, torch.stack(shown)
 
     def completing(self, likelihoods: Tensor, shown: Tensor, count: int) -> list[int]:
-        """Indices of at most ``count`` views, as :meth:`judged`. The next one always has the
-        largest product of its likelihood and of what it adds to those before."""
+        """Indices of at most ``count`` views, from the result of :meth:`judged`. Greedy: the next
+        view has the largest product of its likelihood and its addition to earlier views."""
         likely = (likelihoods - likelihoods.max()).exp().float()
         shown = shown[:, self._targets].float()
         coverage = torch.zeros_like(shown[0])
@@ -262,8 +260,8 @@ class Sampler:
         return taken
 
     def _drawn(self, count: int, generator: torch.Generator) -> Tensor:
-        """Candidates (count, 4, 4): half of them at random distances from Gaussians, half from
-        likely photo places."""
+        """Candidates (count, 4, 4): half of them at random distances from Gaussians, half at likely
+        photo places."""
         half = count // 2 if len(self._traces.places) else 0
         at_gaussians = self._at_gaussians(count - half, generator)
         return (
@@ -272,7 +270,7 @@ class Sampler:
 
     def _at_gaussians(self, count: int, generator: torch.Generator) -> Tensor:
         """Cameras (count, 4, 4) that look at Gaussians at any pitch, from where their neighbourhood
-        is as small as in photos, or, if that is too far away, from any distance."""
+        is as small as in photos, or from any distance if that is too far away."""
         up = self.up.direction
         aim = self._some_targets(count, generator)
         angle, turn, pitch = torch.rand(3, count, generator=generator, **DOUBLES)
@@ -290,8 +288,8 @@ class Sampler:
         return look_at(target - distance[:, None] * ahead, target, up)
 
     def _from_places(self, count: int, generator: torch.Generator) -> Tensor:
-        """Cameras (count, 4, 4) near photo places, which are drawn by their shares, each looking at
-        a Gaussian."""
+        """Cameras (count, 4, 4) near photo places, drawn by their shares, each looking at a
+        Gaussian."""
         up = self.up.direction
         traces = self._traces
         drawn = torch.multinomial(
@@ -303,7 +301,7 @@ class Sampler:
         return look_at(eyes, self.few.means[self._some_targets(count, generator)].double(), up)
 
     def _some_targets(self, count: int, generator: torch.Generator) -> Tensor:
-        """Indices (count,) of Gaussians to look at, each as likely as any other."""
+        """Indices (count,) of random target Gaussians, with equal probabilities."""
         return self._targets[
             torch.randint(len(self._targets), (count,), generator=generator, device="cpu")
         ]

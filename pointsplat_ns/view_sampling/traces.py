@@ -1,16 +1,15 @@
-"""Traces that photos leave in the Gaussians of a scene: where photos were taken, and which parts
-they showed.
+"""Traces of photos in the Gaussians of a scene: where photos were taken, and what they showed.
 
-Training starts without SH, or with round Gaussians of one colour. Each photo that shows a Gaussian
-changes its SH coefficients and flattens it onto the surface. A Gaussian that no photo shows stays
-as it was. So the energy of the SH and the flatness of a neighbourhood grow with the number of
-photos that showed it, occlusion included.
+Training starts without SH, or with round Gaussians of one colour. Each photo of a Gaussian changes
+its SH coefficients and flattens it onto the surface. A Gaussian without photos keeps its initial
+values. So the SH energy and the flatness of a neighbourhood grow with the number of photos that
+showed it, including the effect of occlusion.
 
-A photo from direction d moves the coefficients f along Y(d), the SH basis there. So the part of the
-colour that depends on the direction, f . Y, is large towards photo places and small elsewhere: a
+A photo from direction d moves the coefficients f along Y(d), the SH basis there. So the
+direction-dependent part of the colour, f . Y, is large towards photo places and small elsewhere: a
 photo place is one where it is large for many Gaussians. Without SH, sizes give weaker evidence:
-training splits Gaussians that are large in a photo, so that they are small near photo places and
-large far from them.
+training splits Gaussians that are large in a photo, so they are small near photo places and large
+far away.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.view_sampling.settings import looking
 
 MIN_SH = 1e-4
-"""Length of a vector of SH coefficients, root of the sum of squares, up to which it counts as not
-trained."""
+"""Length of an SH coefficient vector, root of the sum of squares, up to which it counts as
+untrained."""
 
 
 def trace_factors(scene: Gaussians, members: Tensor) -> Tensor:
-    """Trace factor of each member: large where photos showed its neighbourhood well, 1 for the
-    median member.
+    """Trace factor of each member: large if photos showed its neighbourhood well, 1 for the median
+    member.
 
     Args:
         scene, members: as for :func:`traces_around`.
@@ -46,11 +45,11 @@ def trace_factors(scene: Gaussians, members: Tensor) -> Tensor:
 
 
 def traces_around(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean energy of the SH and mean flatness of the neighbourhood of each member.
+    """Mean SH energy and mean flatness of each member's neighbourhood.
 
     Args:
         scene: N Gaussians.
-        members: (n,) indices, n at least 1, in an order in which neighbours are near each other.
+        members: (n,) indices, n at least 1, in an order that puts neighbours together.
 
     Returns:
         (n,) each, float64.
@@ -79,22 +78,20 @@ def factors_of(energy: Tensor, flatness: Tensor) -> Tensor:
 
 
 def _energy(sh: Tensor) -> Tensor:
-    """Sums of squares (n,) of SH coefficients (n, K, 3), which are bounded by 1,000; a colour of 1
-    is white."""
+    """Sums of squares (n,) of SH coefficients (n, K, 3), clamped at 1,000; a colour of 1 is
+    white."""
     return sh.clamp(-1e3, 1e3).square().sum((1, 2))
 
 
 def _flatness(scales: Tensor) -> Tensor:
-    """Logarithms (n,) of width over thickness of log-scales (n, 3)."""
+    """Logarithms (n,) of width over thickness from log-scales (n, 3)."""
     thickness, width, length = scales.sort(dim=1).values.unbind(1)
-    return (
-        (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, 7.0)
-    )  # flat ones of any kind are alike
+    # flat ones of any kind are alike
+    return (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, 7.0)
 
 
 def means_around(values: Tensor, count: int) -> Tensor:
-    """Means (n,) of values (n,) over the ``count`` nearest in their order, an odd number; fewer at
-    the ends."""
+    """Moving average (n,) of values (n,) over ``count`` items, an odd number; fewer at the ends."""
     means: Tensor = avg_pool1d(
         values[None, None], count, stride=1, padding=count // 2, count_include_pad=False
     )
@@ -102,29 +99,28 @@ def means_around(values: Tensor, count: int) -> Tensor:
 
 
 class PhotoTraces:
-    """What a scene tells of the places of its photos, in its unit. Gaussians that are drawn from
-    those with SH are compared with places; if there are none, the sizes of four times as many are,
-    of which one says less."""
+    """Photo places estimated from a scene, in its unit. A random selection of Gaussians with SH is
+    compared with places. If there are none, the sizes of four times as many are used, because a
+    single size is weaker evidence."""
 
     places: Tensor
-    """(P, 3) float64, drawn evenly from a box 1.5 times that of the Gaussians; none if no Gaussian
-    is compared."""
+    """(P, 3) float64, uniform in a box 1.5 times that of the Gaussians; empty if no Gaussian can be
+    compared."""
     shares: Tensor
     """(P,) of the photos, which sum to 1."""
     sure: bool
-    """Whether the best place explains enough for photos to have been taken there."""
+    """Whether the best place explains enough to be a photo place."""
 
     def __init__(self, scene: Gaussians):
         generator = torch.Generator().manual_seed(0)
         count = looking().evidence_count
-        some = scene[
-            torch.randperm(len(scene), generator=generator, device="cpu")[: 8 * count]
-        ]  # some are faint
+        # some are faint
+        some = scene[torch.randperm(len(scene), generator=generator, device="cpu")[: 8 * count]]
         sh = unit_sh(some.features_rest)
         opaque = some.usable() & (some.alphas > looking().min_opacity)
         with_sh = opaque & (sh != 0).any(2).any(1)
         self.has_sh = bool(with_sh.any())
-        """Whether SH are compared, not sizes."""
+        """Whether SH are compared, instead of sizes."""
         chosen = with_sh.nonzero()[:count, 0] if self.has_sh else opaque.nonzero()[: 4 * count, 0]
         self._means = some.means[chosen].double()
         self._sh = sh[chosen]
@@ -146,7 +142,7 @@ class PhotoTraces:
         )
 
     def evidence(self, places: Tensor) -> Tensor:
-        """Evidence for each place (P, 3), (P,) float32: the mean of the :func:`explained_energy`;
+        """Evidence (P,) float32 for places (P, 3): the mean of the :func:`explained_energy`;
         without SH, the correlation of the logarithms of size and distance."""
         if self.has_sh:
             return torch.stack(
@@ -162,16 +158,16 @@ class PhotoTraces:
 
 
 def unit_sh(sh: Tensor) -> Tensor:
-    """SH coefficients (n, K, 3), scaled to a length of 1 for each Gaussian, float32; 0 if they are
-    at most :data:`MIN_SH` long."""
+    """SH coefficients (n, K, 3) normalised per Gaussian, float32; 0 if their length is at most
+    :data:`MIN_SH`."""
     sh = sh.double().clamp(-1e3, 1e3)
     length = _energy(sh).sqrt()[:, None, None]
     return torch.where(length > MIN_SH, sh / length.clamp_min(MIN_SH), 0.0).float()
 
 
 def log_widths(scales: Tensor) -> Tensor:
-    """Logarithms (n,) of the geometric means of the two larger standard deviations of log-scales
-    (n, 3), float64; finite, or NaN where a log-scale is."""
+    """Logarithms (n,) of the geometric means of the two larger standard deviations from log-scales
+    (n, 3), float64; finite, or NaN if a log-scale is."""
     return scales.double().clamp(-100.0, 100.0).sort(dim=1).values[:, 1:].mean(1)
 
 
@@ -181,8 +177,8 @@ def correlation(a: Tensor, b: Tensor) -> Tensor:
 
 
 def explained_energy(offsets: Tensor, sh: Tensor) -> Tensor:
-    """Share of the energy of SH that lies along the basis in one direction each, relative to its
-    mean over SH of random directions.
+    """Share of the SH energy along the basis in one direction per Gaussian, relative to its mean
+    over SH of random directions.
 
     Args:
         offsets: (n, 3) from an eye to Gaussians, of any length.

@@ -1,9 +1,9 @@
-"""Estimates which way is up in a scene that comes without cameras.
+"""Estimates the up direction of a scene without cameras.
 
-What stands upright has surfaces that are level or vertical (floors, tables, walls, legs), whichever
-way furniture is turned; and level surfaces share their heights (a floor, a table top). The
-Gaussians show both: the shortest axis of a flat Gaussian is the normal of its surface. And people
-photograph from above: more is seen from there than from below.
+Upright scenes have level and vertical surfaces (floors, tables, walls, legs), however furniture is
+turned; and level surfaces have common heights (a floor, a table top). Gaussians show both: the
+shortest axis of a flat Gaussian is the normal of its surface. People also photograph from above:
+more is visible from there than from below.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from pointsplat_ns.view_sampling.poses import around, level_directions, whole_vi
 from pointsplat_ns.view_sampling.settings import looking
 
 CONTENT_RADIUS = 6.0
-"""Distance from the centre of the content within which points belong to it, units."""
+"""Distance from the content's centre within which points belong to it, units."""
 
 
 @dataclass(frozen=True, eq=False)
 class Up:
-    """The direction that is up in a scene."""
+    """The up direction of a scene."""
 
     direction: Tensor
-    """(3,) float64, of length 1."""
+    """(3,) float64, unit length."""
     sure: bool = True
-    """Whether it was named or declared, or clearly more of the scene is seen from above than from
-    below."""
+    """Whether it was named or declared, or clearly more of the scene is visible from above than
+    from below."""
 
     def __str__(self) -> str:
-        """The name of the axis, or the direction.
+        """Name of the axis, or the direction.
 
         Example:
             >>> str(Up(torch.tensor([0.0, -1.0, 0.0]), sure=False))
@@ -55,7 +55,7 @@ def up_named(text: str | None) -> Up | None:
     """The up direction along a world axis, by a name such as "z" or "-y"; None for None.
 
     Raises:
-        PointSplatError: if there is no such axis.
+        PointSplatError: for any other name.
     """
     if text is None:
         return None
@@ -66,24 +66,24 @@ def up_named(text: str | None) -> Up | None:
 
 
 def known_up(named: Up | None, scene: Gaussians) -> Up | None:
-    """The up direction that needs no estimate: the named one, else the one that the scene's file
-    declares."""
+    """The up direction without an estimate: the named one, or else the one declared by the scene's
+    file."""
     return named or up_named(scene.up)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points drawn from the Gaussians of a scene, in its unit. A point lies within its Gaussian."""
+    """Points sampled from the Gaussians of a scene, in its unit; each is within its Gaussian."""
 
     points: Tensor  # [M, 3] float64
-    normals: Tensor  # [M, 3] float64, along the shortest axis of the Gaussian, of either sign
-    flatness: Tensor  # [M] float64 in [0, 1]: 1 less the ratio of the shortest axis to the next
+    normals: Tensor  # [M, 3] float64, along the Gaussian's shortest axis, of either sign
+    flatness: Tensor  # [M] float64 in [0, 1]: 1 minus the ratio of the shortest axis to the next
 
     @staticmethod
     def of(scene: Gaussians) -> Surface:
-        """The surface of a scene of which something is visible. Gaussians are drawn by the root of
-        opacity times area: by their number the detail of photos would count alone, and by their
-        area the walls."""
+        """The surface of a scene with visible content. Gaussians are sampled by the square root of
+        opacity times area: sampling by number would favour the detail of photos, and by area the
+        walls."""
         generator = torch.Generator().manual_seed(0)
         alphas = scene.alphas.double()
         count = 12_288
@@ -93,34 +93,31 @@ class Surface:
             + clear.scales.double().topk(2).values.sum(1)
         )
         ranked = logs.clamp_min(torch.finfo(torch.float64).min).sort().values
-        bounded = logs.clamp(
-            ranked[0], ranked[int(0.99 * (len(ranked) - 1))]
-        )  # a few giants do not count for all
+        # so that a few giants do not dominate
+        bounded = logs.clamp(ranked[0], ranked[int(0.99 * (len(ranked) - 1))])
         cumulative = (bounded - ranked[-1]).exp().cumsum(0)
         drawn = torch.rand(count, generator=generator, **DOUBLES) * cumulative[-1]
         some = clear[torch.searchsorted(cumulative, drawn).clamp_max(len(clear) - 1)]
-        stds, order = (
-            some.stds.double().clamp_max(1e6 * UNITS).sort(dim=1)
-        )  # what is farther away is as good as there
-        axes = rotation_matrices(some.quats.double()).gather(
-            2, order[:, None, :].expand(-1, 3, 3)
-        )  # in columns
+        # larger deviations count as this one
+        stds, order = some.stds.double().clamp_max(1e6 * UNITS).sort(dim=1)
+        # in columns
+        axes = rotation_matrices(some.quats.double()).gather(2, order[:, None, :].expand(-1, 3, 3))
         offsets = torch.randn(count, 3, generator=generator, **DOUBLES).clamp(-1.5, 1.5) * stds
         points = some.means.double() + (axes @ offsets[..., None])[..., 0]
         return Surface(points, axes[:, :, 0], 1 - stds[:, 0] / stds[:, 1].clamp_min(1e-300))
 
 
 def upright(few: Gaussians, surface: Surface, traced: bool) -> Up:
-    """Which way is up, of a scene in units of its content, with its surface. ``traced`` as
+    """Up direction of a scene in units of its content, from its surface. ``traced`` is as for
     :func:`upright_axis`.
 
-    It is the end of :func:`upright_axis` from which more is seen. If about the same is seen, z is
-    up, or -y, as in scenes that have the axes of their first camera.
+    It is the end of :func:`upright_axis` from which more is visible. If the difference is small, z
+    is up, or -y, as in scenes in the frame of their first camera.
     """
     axis = upright_axis(surface, traced)
 
     def seen_from(up: Tensor) -> int:
-        """The largest number of Gaussians that a camera around the content shows."""
+        """Maximum number of Gaussians that a camera around the content shows."""
         views = whole_views(surface.points, up, around(6), 30.0, 128, 80)
         return max(int((pixels_of(few, view) > 0.1).sum()) for view in views)
 
@@ -133,12 +130,12 @@ def upright(few: Gaussians, surface: Surface, traced: bool) -> Up:
 
 
 def upright_axis(surface: Surface, traced: bool = False) -> Tensor:
-    """The axis (3,) along which a scene stands, float64, of length 1 and of either sign.
+    """Vertical axis (3,) of a scene, float64, unit length, either sign.
 
-    It is an axis of the world if that fits about as well as the best direction, and y if that fits
-    about as well as the best of the three. A capture, of which ``traced`` says that it shows where
-    photos were taken, may have any frame: all axes of the world have a tenth more there, by which
-    two of six stand along one.
+    It is a world axis if that fits about as well as the best direction, and y if that fits about as
+    well as the best of the three. A capture may have any frame, if ``traced`` says that it shows
+    where photos were taken: there all world axes get a tenth more, which aligns two of six captures
+    with one.
     """
     near = surface.points.norm(dim=1) < CONTENT_RADIUS
     near = (near if bool(near.any()) else ~near).nonzero()[:4096, 0]
@@ -148,12 +145,11 @@ def upright_axis(surface: Surface, traced: bool = False) -> Tensor:
     weights = flatness / flatness.sum().clamp_min(1e-300)
 
     def uprightness(axes: Tensor) -> Tensor:
-        """Evidence (D,) that a scene stands along axes (D, 3): the shares of level and of vertical
-        surfaces, less their mean of 0.193 over random directions, and the largest share of points
-        in one thin level slab."""
-        tilt = torch.rad2deg(
-            torch.asin((axes @ normals.T).abs().clamp_max(1))
-        )  # [D, n] 90 where level
+        """Evidence (D,) for vertical axes (D, 3): the shares of level and of vertical surfaces,
+        minus their mean of 0.193 over random directions, plus the largest share of points in one
+        thin level slab."""
+        # [D, n] 90 where level
+        tilt = torch.rad2deg(torch.asin((axes @ normals.T).abs().clamp_max(1)))
         level, vertical = ((-0.5 * (angle / 8.0).square()).exp() for angle in (90 - tilt, tilt))
         slab = ((axes @ points.T + CONTENT_RADIUS) / 0.1).long().clamp(0, 119)
         counts = torch.zeros(len(axes), 120, **DOUBLES)
@@ -162,9 +158,8 @@ def upright_axis(surface: Surface, traced: bool = False) -> Tensor:
             1
         ) / len(points)
 
-    index = (
-        torch.arange(400, **DOUBLES) + 0.5
-    )  # of directions about 7 degrees apart, on Fibonacci's spiral
+    # directions about 7 degrees apart, on a Fibonacci spiral
+    index = torch.arange(400, **DOUBLES) + 0.5
     height = 1 - index / 400
     ring = (1 - (1 - index / 400).square()).sqrt()
     turn = index * math.pi * (3 - math.sqrt(5))

@@ -160,7 +160,7 @@ def test_a_file_that_appears_during_the_work_stays(name, links, scenes, here, ca
         main([*WORK[name]])
     said = capsys.readouterr()
     assert end.value.code == 1
-    assert f"{name}: another file of this name has appeared meanwhile" in said.err + said.out
+    assert f"{name}: another file of this name appeared meanwhile" in said.err + said.out
     assert Path(name).read_text() == "a stranger's"
     assert not hidden(here)
 
@@ -178,7 +178,7 @@ def test_a_folder_that_appears_during_the_work_stays(name, scenes, here, capsys,
     with pytest.raises(SystemExit) as end:
         main([*FOLDERS[name]])
     assert end.value.code == 1
-    assert f"{file}: another file of this name has appeared" in capsys.readouterr().err
+    assert f"{file}: another file of this name appeared" in capsys.readouterr().err
     assert file.read_text() == "a stranger's" and [*Path(name).iterdir()] == [file]
     assert not hidden(here)
 

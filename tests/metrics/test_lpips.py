@@ -269,7 +269,7 @@ def test_files_that_are_no_backbone_are_said(alex_file, tmp_path, content, messa
 def test_a_folder_that_is_named_and_not_there_is_said(tmp_path, monkeypatch, nowhere):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "gone"))
     with pytest.raises(
-        LpipsUnavailable, match=f"gone: no such folder, though {WEIGHTS_VARIABLE} names it"
+        LpipsUnavailable, match=f"gone: no such folder; {WEIGHTS_VARIABLE} names it"
     ):
         load_lpips()
     with pytest.raises(

@@ -130,7 +130,7 @@ def test_absgrad_is_the_sum_over_pixels_of_absolute_gradients(packed):
         (dict(viewmats=torch.full((1, 4, 4), math.inf)), "viewmat is .*inf.*expected finite"),
         (
             dict(Ks=torch.tensor([[[0.0, 0, 4], [0, 9, 4], [0, 0, 1]]])),
-            "fx 0.0.*focal lengths not 0",
+            "fx 0.0.*focal lengths other than 0",
         ),
         (dict(Ks=torch.tensor([[[9.0, 0, 4], [0, 9, math.nan], [0, 0, 1]]])), "cy nan"),
         (

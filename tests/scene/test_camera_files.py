@@ -185,7 +185,7 @@ def test_transforms_that_are_no_rigid_motion_are_refused(tmp_path):
     written(doubled, tmp_path / "dataparser_transforms.json")
     fails(
         lambda: read_views(path),
-        "dataparser_transforms.json: its transform is no rigid motion",
+        "dataparser_transforms.json: its transform is not a rigid motion",
         error=ps.DataError,
     )
 
@@ -242,16 +242,16 @@ def inria_with(**changes) -> list:
     ("content", "message"),
     [
         ("[" * 100_000, "cannot be read as JSON"),
-        ({"camera_path": []}, "a path for `ns-render camera-path`; expected"),
+        ({"camera_path": []}, "camera path of `ns-render`; expected"),
         ([], "0 cameras; expected 1 to 100000"),
-        (inria_with(position=[10**400, 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
+        (inria_with(position=[10**400, 0, 0]), r"the pose of camera 1 (.*)?is not a rigid motion"),
         (inria_with(position=[1e10, 0, 0]), r"camera 1 \(frame_0.png\) is too far away"),
         (
             inria_with(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
-            r"the pose of camera 1 (.*)?is no rigid motion",
+            r"the pose of camera 1 (.*)?is not a rigid motion",
         ),
         (inria_with(fx=1e12), "camera 1 .* has no usable focal length"),
-        ({"fl_x": 5, "w": 4, "h": 4, "frames": [3]}, "camera 0 is no frame"),
+        ({"fl_x": 5, "w": 4, "h": 4, "frames": [3]}, "camera 0 is not a frame"),
         (framed(cx=1e9), "camera 0 .* has its principal point far outside"),
         (
             framed(camera_model="EQUIRECTANGULAR"),
@@ -263,7 +263,7 @@ def inria_with(**changes) -> list:
         ),
         (
             {**framed(), "applied_transform": [[0, 0, 0, 0]] * 3},
-            "its 'applied_transform' is no rigid motion",
+            "its 'applied_transform' is not a rigid motion",
         ),
         (without(framed(), "fl_x", "fl_y"), "camera 0 has no focal length"),
         (without(framed(), "w"), "camera 0 has no size; expected numbers 'w' and 'h'"),
@@ -301,7 +301,7 @@ POINTS_AT = NAME_AT + len(name_of(0)) + 1
     [
         (
             damaged("cameras.txt", lambda _: b"3 PINHOLE 64 48 50 50 30\n"),
-            "cameras.txt: '3 PINHOLE 64 48 50 50 30' is no camera",
+            "cameras.txt: '3 PINHOLE 64 48 50 50 30' is not a camera",
         ),
         (
             damaged("cameras.txt", lambda _: b"3 EQUIRECTANGULAR 64 48 64 48\n"),
@@ -309,7 +309,7 @@ POINTS_AT = NAME_AT + len(name_of(0)) + 1
         ),
         (
             damaged("images.txt", lambda _: b"1 1 0 0 0 0 0 0 3\n\n"),
-            "images.txt: '1 1 0 0 0 0 0 0 3' is no image",
+            "images.txt: '1 1 0 0 0 0 0 0 3' is not an image",
         ),
         (
             damaged("images.txt", lambda _: b"1 1 0 0 0 0 0 0 3 " + b"a" * 10_000),
@@ -317,20 +317,20 @@ POINTS_AT = NAME_AT + len(name_of(0)) + 1
         ),
         (
             images_with(0, struct.pack("<Q", 2**63)),
-            r"images.bin: says that it has \d+ entries and has room for 2",
+            r"images.bin: declares \d+ entries, has room for 2",
         ),
         (
             images_with(8 + 4, struct.pack("<d", math.nan)),
-            "the pose of camera 0 .frame_0.png. is no rigid motion",
+            "the pose of camera 0 .frame_0.png. is not a rigid motion",
         ),
         (
             images_with(POINTS_AT, struct.pack("<Q", 2**62)),
-            "an image with 4611686018427387904 points, for which the",
+            "an image with 4611686018427387904 points, more than the file",
         ),
-        (images_with(NAME_AT, b"a" * 20_000), "no end of an image's name within 4096 bytes"),
+        (images_with(NAME_AT, b"a" * 20_000), "image name does not end within 4096 bytes"),
         (
             damaged("images.bin", lambda data: data[: NAME_AT + 3]),
-            r"images.bin: says that it has 2 entries and has room for 0",
+            r"images.bin: declares 2 entries, has room for 0",
         ),
     ],
 )
@@ -367,7 +367,7 @@ def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypa
         read_views(tmp_path / "nothing.json")
     fails(
         lambda: read_views(tmp_path),
-        "a folder without cameras.bin or cameras.txt, there or in sparse/0; expected",
+        "no cameras.bin or cameras.txt in the folder or its sparse/0; expected",
     )
     folder = write_sparse(some_views(2), tmp_path / "sparse", ".bin")
     (folder / "cameras.bin").unlink()

@@ -235,7 +235,7 @@ def test_a_part_of_a_training_on_several_gpus_is_refused(tmp_path):
     for name in ("ckpt_9_rank0.pt", "ckpt_9_rank1.pt", "ckpt_8_rank0.pt"):
         torch.save({"step": 9, "splats": splats_of(GOOD)}, tmp_path / name)
     for name in ("ckpt_9_rank0.pt", "ckpt_9_rank1.pt"):
-        fails(tmp_path / name, "a part of a training on several GPUs", "--save_ply")
+        fails(tmp_path / name, "one part of a multi-GPU training", "--save_ply")
     assert same_bits(read_scene(tmp_path / "ckpt_8_rank0.pt"), GOOD)
 
 
@@ -369,7 +369,7 @@ def nested(first, line, depth, *last):
             ),
             "65536 values",
         ),
-        ("!!python/object:a.B\nmethod_name: &x [*x]", "holds itself"),
+        ("!!python/object:a.B\nmethod_name: &x [*x]", "contains itself"),
         (
             nested("{k: v}", "x{i}: &x{i} {{<<: [*x{before}, *x{before}]}}", 4),
             "merge keys are not supported at line 3",

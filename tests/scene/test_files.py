@@ -36,7 +36,7 @@ def test_a_name_that_is_too_long_is_the_error_that_is_told(tmp_path, name):
 )
 def test_a_place_where_no_file_can_be_is_one_error(tmp_path, path):
     (tmp_path / "file").touch()
-    said = "a.ply: cannot be written|/dev/null: not a regular file|holds a NUL character"
+    said = "a.ply: cannot be written|/dev/null: not a regular file|contains a NUL character"
     with pytest.raises(SceneError, match=said):
         write(tmp_path / path)
     assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
@@ -60,7 +60,7 @@ def test_a_link_that_leads_nowhere_is_refused_and_makes_no_file(target, tmp_path
     link = tmp_path / "link.ply"
     link.symlink_to(target)
     with pytest.raises(
-        SceneError, match="link.ply: (a link to .*, where nothing is; remove it|not a regular file)"
+        SceneError, match="link.ply: (a broken link to .*; remove it|not a regular file)"
     ):
         write(link)
     assert [*tmp_path.iterdir()] == [link] and link.is_symlink()
@@ -130,7 +130,7 @@ def test_only_files_and_the_newest_run_of_each_experiment_are_scenes(make_run, t
     plys = {"deep/er/HALL": "deep/er/HALL.PLY", "hall": "hall.ply", "kitchen_ply": "kitchen.ply"}
     assert found == {"kitchen": newest, **{name: folder / path for name, path in plys.items()}}
     assert all(len(read_scene(path)) > 0 for path in found.values())
-    assert "passed over" in caplog.text and "points.ply" in caplog.text
+    assert "skipped" in caplog.text and "points.ply" in caplog.text
 
 
 def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_path):
@@ -149,8 +149,7 @@ def test_results_of_earlier_commands_are_no_scenes(tmp_path, caplog):
     (tmp_path / "room_lod" / "lod.json").touch()
     assert [*find_scenes(tmp_path)] == ["deep/room_pruned", "other_compact", "room"]
     assert (
-        f"passed over {tmp_path / 'room_compact.spz'}: a result of {tmp_path / 'room'}"
-        in caplog.text
+        f"skipped {tmp_path / 'room_compact.spz'}: a result of {tmp_path / 'room'}" in caplog.text
     )
 
 

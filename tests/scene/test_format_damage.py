@@ -136,7 +136,7 @@ def test_a_sog_that_lies_is_refused_by_what_is_wrong(tmp_path, change, fragment)
         ),
         (b"element sh 300", b"element sh 200", "'sh' has 200 rows"),
         (b"element chunk 2", b"element other 2", "lacks the element 'chunk'"),
-        (b"binary_little_endian", b"binary_big_endian", "another byte order"),
+        (b"binary_little_endian", b"binary_big_endian", "big-endian or ASCII"),
     ],
 )
 def test_a_compressed_ply_that_lies_is_refused_by_what_is_wrong(tmp_path, old, new, fragment):

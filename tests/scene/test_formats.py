@@ -128,7 +128,7 @@ REFUSED = {
         zip_of({"room/a.ply": "ply\n"}),
         "zip of a PLY files are not read; unpack it and name the PLY",
     ),
-    "z.zip": (zip_of({"a.ply": "ply\n" * 99})[:-30], "a zip archive that is truncated or damaged"),
+    "z.zip": (zip_of({"a.ply": "ply\n" * 99})[:-30], "a truncated or damaged zip archive"),
     "z.splat": (b"# a text of words and numbers 32\n" * 32, "text"),
     "z.spz": (gzip.compress(b"ply\nformat ascii 1.0\n"), "SPZ of b'ply\\n'"),
     "x.glb": (b"glTF" + bytes(60), "glTF files are not read; export the scene"),

@@ -32,7 +32,7 @@ HOSTILE = {
     ),
     "torch.Tensor": Called("torch.Tensor", MANY),
     "torch.nn.parameter.Parameter": Called("torch.nn.parameter.Parameter", Called("torch.Tensor")),
-    "a key that is no number": {(1, 2): 3},
+    "a key that is neither a number nor text": {(1, 2): 3},
 }
 """What an error names, and a value whose pickle asks for it."""
 

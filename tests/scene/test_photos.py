@@ -119,9 +119,9 @@ def test_beyond_where_a_polynomial_turns_back_no_pixel_is_shown():
     ("changes", "text"),
     [
         ({"model": "FOV", "distortion": (0.9,)}, "distortion of the model FOV"),
-        ({"model": "OPENCV", "distortion": (-1e6, 0.0, 0.0, 0.0)}, "leaves nothing of the photo"),
+        ({"model": "OPENCV", "distortion": (-1e6, 0.0, 0.0, 0.0)}, "leaves no pixels"),
         ({"mask": "../secret.png"}, "no such mask"),
-        ({"size": (48, 64)}, "64 x 48 pixels, but its camera says 48 x 64"),
+        ({"size": (48, 64)}, "64 x 48 pixels, but its camera is for 48 x 64"),
     ],
 )
 def test_cameras_that_do_not_fit_a_photo_are_refused(changes, text, tmp_path):

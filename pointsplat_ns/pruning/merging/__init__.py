@@ -1,7 +1,6 @@
-"""Merging: replaces a scene by fewer Gaussians that look the same, from the scene's 3D attributes
-alone.
+"""Merging: replaces a scene by fewer Gaussians that look the same, from its 3D attributes alone.
 
-Over a few rounds, pairs of neighbours are replaced by one Gaussian each. README.md in this folder
+In each round, pairs of neighbours are replaced by one Gaussian each. README.md in this folder
 explains the steps, in the order of :mod:`~pointsplat_ns.pruning.merging.rounds`.
 """
 

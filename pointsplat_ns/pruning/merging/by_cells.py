@@ -1,17 +1,15 @@
 """Merging of scenes that are larger than memory: cell by cell, with files in between.
 
-1. Parts of the curve with equally many Gaussians are the **cells**; each gets a file of its own
-  (``cells.py``).
-2. Thinned scenes give views, visibility weights and axes of colours: the overview. Views and
-  weights are those of
-   merging in memory.
-3. A round finds pairs in each cell. The cheapest of all cells are merged: one price holds
-  everywhere, and the count is
-   exact.
+1. Parts of a space-filling curve with equal numbers of Gaussians are the **cells**; each has a
+   file (``cells.py``).
+2. Thinned scenes give views, visibility weights and colour axes: the overview. Views and weights
+   are those of merging in memory.
+3. A round finds pairs in each cell. The cheapest of all cells are merged: one price limit applies
+   to all cells, and the count is exact.
 4. In each cell, members are regrouped, and their rows are written.
 
-What a step has written is kept, and a command that was killed resumes from there. Several processes
-may share the cells.
+Finished steps stay on disk, and a killed command resumes from them. Several processes may share the
+cells.
 """
 
 from __future__ import annotations
@@ -64,28 +62,28 @@ def merge_file(
     settings: MergeSettings = MERGING,
     jobs: int = 1,
 ) -> tuple[int, int]:
-    """Merge the Gaussians of a file, and write those that remain, cell by cell.
+    """Merge the Gaussians of a file, cell by cell, and write the result.
 
     Args:
         rows: the Gaussians. Those that cannot be drawn are dropped.
-        count_of: from the number N of the others to the number of those that remain, in 1..N.
+        count_of: maps the number N of the others to the number after merging, in 1..N.
         output: the PLY to write.
-        most: largest number of Gaussians in a cell, about.
-        scratch: where finished steps are kept.
-        views: from every so many-th Gaussian to known views, or None for sampled ones.
-        sampler: from Gaussians of the scene, and how many each ``stands_for``, to the sampler of
-            their views.
-        progress: called with what is being done, and the share done of it.
+        most: approximate maximum number of Gaussians in a cell.
+        scratch: folder of finished steps.
+        views: maps every n-th Gaussian to known views, or None for sampled ones.
+        sampler: maps Gaussians of the scene, each of which ``stands_for`` several, to the sampler
+            of their views.
+        progress: called with the current task and its share done.
         settings: the tuned numbers.
-        jobs: number of processes that share the cells. The result is the same to the bit.
+        jobs: number of processes that share the cells. The result is exact to the bit for any
+            number.
 
     Returns:
         The numbers of Gaussians before and after.
 
     Raises:
         SceneError: if a file cannot be read or written, or no Gaussian can be drawn.
-        BudgetError: that ``count_of`` raises, or if there are more cells than Gaussians that
-            remain.
+        BudgetError: from ``count_of``, or if there are more cells than Gaussians after merging.
         PointSplatError: if processes are killed.
     """
     cells = divided(rows, most, scratch, functools.partial(progress, "dividing into cells"))
@@ -97,10 +95,10 @@ def merge_file(
         )
 
     def look() -> dict[str, Tensor]:
-        report = functools.partial(progress, "looking for views")
+        report = functools.partial(progress, "sampling views")
         report(0.0)
         step = thinning(rows.count, looking().sampled_count)
-        some = enlarged(rows.pick(range(0, rows.count, step)), step)  # they cover as much as all
+        some = enlarged(rows.pick(range(0, rows.count, step)), step)  # cover as much as all
         with one_thread_each():
             seen = views_to_weigh(
                 cells.starts(k)[-1], views(some) or sampler(some, stands_for=step), settings
@@ -111,7 +109,7 @@ def merge_file(
     with Workers(work, jobs) as workers:
 
         def each(what: str, *step: float) -> None:
-            """Every cell takes a step."""
+            """Run a step on every cell."""
             progress(what, 0.0)
             for done, _ in enumerate(
                 workers.results([(cell, *step) for cell in range(len(cells))]), 1
@@ -142,7 +140,7 @@ def merge_file(
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """What all cells have to know of the whole scene."""
+    """Data of the whole scene that all cells need."""
 
     centre: Tensor  # [3] float64, of the content
     size: Tensor  # scalar float64, diagonal of the content, scene units
@@ -162,8 +160,8 @@ def overview_of(
     report: Callable[[float], None],
 ) -> Overview:
     """The overview of cells that become ``k`` Gaussians, with views of :func:`views_to_weigh`, and
-    whether trace factors count. Every so many-th member of all is drawn: a sample of the file would
-    have holes, through which what is hidden shows."""
+    whether trace factors apply. Every n-th member of all cells is drawn, because a sample of the
+    file would have holes that show hidden Gaussians."""
     *starts, count = cells.starts(k)
     step = drawn_step(count, settings)
     parts = []
@@ -191,8 +189,8 @@ def overview_of(
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """The steps of cells. Called with a cell, the number of rounds before, and to finish it the
-    change of sizes."""
+    """The work on a cell. Called with the cell, the number of earlier rounds and, for the finish,
+    the size change."""
 
     cells: Cells
     overview: Overview
@@ -211,8 +209,8 @@ class _Work:
                 self.write(rounds, cell, size_change[0], part)
 
     def pairs(self, number: int, cell: int) -> dict[str, Tensor]:
-        """The state of a cell after ``number`` rounds, the ``group`` (n,) of each participant in
-        it, and the pairs that may be merged next."""
+        """State of a cell after ``number`` rounds, the ``group`` (n,) of each participant in it,
+        and the pairs that may be merged next."""
         with one_thread_each():
             state, group = self.state(number, cell)
             near = other_neighbours(state.means.double(), self.settings.neighbours)
@@ -222,8 +220,8 @@ class _Work:
         return {**vars(state), "group": group.int(), **pairs}
 
     def choose(self, number: int) -> dict[str, Tensor]:
-        """Which pairs of each cell, (E,) bool by its number, are the cheapest of all, and how many
-        Gaussians are ``left`` then."""
+        """For each cell, by its number, a mask (E,) of the pairs that are the cheapest of all
+        cells; and the number of Gaussians ``left`` after merging them."""
         left = 0
         prices = []
         for cell in range(len(self.cells)):
@@ -238,8 +236,7 @@ class _Work:
         }
 
     def state(self, number: int, cell: int) -> tuple[State, Tensor]:
-        """The state of a cell after ``number`` rounds, and the group (n,) of each participant in
-        it."""
+        """State of a cell after ``number`` rounds, and the group (n,) of each participant in it."""
         scratch = self.cells.scratch
         overview = self.overview
         if number == 0:
@@ -263,11 +260,10 @@ class _Work:
         )
 
     def size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
-        """The finish of the parts in this cell, of four parts that are evenly spread over all
-        cells.
+        """Size changes of the parts in this cell, of four parts evenly spread over all cells.
 
-        In five scenes, an eighth of a scene at a time, their mean factor differs from that of the
-        whole by 0.02 at most. A thinned scene needs smaller factors than the whole.
+        In five scenes, with parts of an eighth of a scene, their mean factor differs from that of
+        the whole by 0.02 at most. A thinned scene needs smaller factors than the whole.
         """
         changes = []
         parts = 4
@@ -284,7 +280,7 @@ class _Work:
         return {"changes": torch.tensor(changes, **FLOATS)}
 
     def write(self, rounds: int, cell: int, size_change: float, path: Path) -> None:
-        """Regroup the members of a cell after so many rounds, and write the rows of its groups."""
+        """Regroup the members of a cell after the rounds, and write the rows of its groups."""
         with one_thread_each():
             state, group = self.state(rounds, cell)
             participants = self.participants(cell)
@@ -298,10 +294,9 @@ class _Work:
 
 
 def lowest(parts: list[Tensor], most: int) -> list[Tensor]:
-    """Which numbers of some parts, float32 and not below 0, are the ``most`` lowest of all, bool as
-    the parts; of equal ones the first. They are counted by the upper half of their bits, then by
-    the lower one, which are in the order of the numbers: sorting all together would take five times
-    their memory."""
+    """Masks of the ``most`` lowest numbers of all parts, float32 and at least 0; of equal numbers,
+    the first. They are counted by the upper half of their bits, then by the lower half, which have
+    the order of the numbers: sorting all of them would take five times their memory."""
     bits = [part.view(torch.int32) for part in parts]
     limit = 0
     rest = most

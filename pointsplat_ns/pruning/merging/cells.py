@@ -1,7 +1,6 @@
-"""A scene that is larger than memory, in cells: parts of a space-filling curve with equally many
-Gaussians.
+"""Divides a scene larger than memory into cells: parts of a space-filling curve of equal counts.
 
-Each cell has a file of its own, in a folder of finished steps.
+Each cell has a file in a folder of finished steps.
 """
 
 from __future__ import annotations
@@ -37,20 +36,20 @@ from pointsplat_ns.system.outputs import is_own_file
 from pointsplat_ns.system.tensors import INDICES
 
 ROWS_AT_ONCE = 1 << 17
-"""Number of rows that are read at once."""
+"""Number of rows per read."""
 
 
 class Scratch:
-    """A folder whose files are complete, or not there.
+    """A folder whose files are complete or missing.
 
     Args:
-        folder: it is created. If it holds steps of other work, or a symbolic link, all in it is
-            removed; so is a link in its place.
-        work: description of the work, as JSON has it: all that its steps depend on.
-        size: bytes of all steps together; they must be free for new work.
+        folder: created if missing. If it contains steps of other work, or a symbolic link, all its
+            content is removed; a link in its place is removed too.
+        work: JSON description of the work: all data that its steps depend on.
+        size: total bytes of all steps; they must be free for new work.
 
     Raises:
-        SceneError: if the folder cannot be used, or the disk has no room for it.
+        SceneError: if the folder cannot be used, or the disk has too little space.
     """
 
     def __init__(self, folder: Path, work: Mapping[str, object], size: int = 0):
@@ -78,7 +77,7 @@ class Scratch:
 
     @contextmanager
     def left_if_useful(self) -> Iterator[None]:
-        """After an error, remove the folder if no step was taken."""
+        """After an error, remove the folder if no step is finished."""
         try:
             yield
         except BaseException:
@@ -87,22 +86,21 @@ class Scratch:
             raise
 
     def has(self, name: str) -> bool:
-        """Whether a step was taken that gave tensors."""
+        """Whether a step with tensors is finished."""
         return self._path(name).is_file()
 
     def make(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> None:
-        """Take a step that gives tensors, unless it was taken before."""
+        """Run a step that returns tensors, unless it is finished."""
         if not self.has(name):
             write_tensors(self._path(name), make(), {})
 
     def tensors(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
-        """The tensors of a step, which is taken if it was not before."""
+        """Tensors of a step, which runs unless it is finished."""
         self.make(name, make)
         return self.known(name)
 
     def known(self, name: str) -> dict[str, Tensor]:
-        """The tensors of a step that was taken. Raises SceneError if its file is gone or
-        damaged."""
+        """Tensors of a finished step. Raises SceneError if its file is missing or damaged."""
         from safetensors import SafetensorError
         from safetensors.torch import load_file
 
@@ -114,7 +112,7 @@ class Scratch:
             ) from error
 
     def drop(self, name: str) -> None:
-        """Remove the tensors of a step, if they are there."""
+        """Remove the tensors of a step, if it is finished."""
         self._path(name).unlink(missing_ok=True)
 
     def remove(self) -> None:
@@ -127,16 +125,16 @@ class Scratch:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """A scene in cells."""
+    """A scene divided into cells."""
 
     scratch: Scratch
-    kind: Gaussians  # [0] with the widths and the traits of all
+    kind: Gaussians  # [0] with the dtypes, SH degree and traits of all
     cube: Cube
-    """What the curve fills."""
+    """The cube of the space-filling curve."""
     counts: tuple[int, ...]
     """Number of Gaussians in each cell."""
     drawable: tuple[int, ...]
-    """Number of those that are not too faint to be drawn."""
+    """Number of Gaussians in each cell that are opaque enough to be drawn."""
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -147,7 +145,7 @@ class Cells:
         return sum(self.counts)
 
     def read(self, cell: int) -> Gaussians:
-        """The Gaussians of a cell, in the order of the file."""
+        """The Gaussians of a cell, in file order."""
         path = self.scratch.folder / _name(cell)
         widths = [values.flatten(1).shape[1] for values in self.kind.tensors()]
         scene = self.kind.map(lambda values: values.new_empty(self.counts[cell], *values.shape[1:]))
@@ -165,8 +163,8 @@ class Cells:
         return scene
 
     def members(self, cell: int, k: int) -> tuple[Gaussians, Tensor]:
-        """The Gaussians of a cell, and the indices (n,) of those that are merged where all together
-        become ``k``, along the curve."""
+        """The Gaussians of a cell, and the indices (n,) of its participants along the curve, where
+        the whole scene becomes ``k`` Gaussians."""
         scene = self.read(cell)
         members = drawable(scene, self.share(cell, k))
         keys = [
@@ -176,12 +174,12 @@ class Cells:
         return scene, members[torch.cat(keys).argsort(stable=True)]
 
     def starts(self, k: int) -> list[int]:
-        """How many members are in all cells before each, and in all."""
+        """Number of members in all cells before each cell, and in total."""
         counts = (max(count, self.share(cell, k)) for cell, count in enumerate(self.drawable))
         return [0, *itertools.accumulate(counts)]
 
     def share(self, cell: int, k: int) -> int:
-        """The share of a cell in ``k`` Gaussians."""
+        """The cell's part of ``k`` Gaussians."""
         return -(-self.counts[cell] * k // self.count)
 
 
@@ -190,8 +188,8 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
 
     Args:
         rows: the scene. Gaussians that cannot be drawn are dropped, and counted in a warning.
-        most: largest number of Gaussians in a cell, about.
-        scratch: where files are.
+        most: approximate maximum number of Gaussians in a cell.
+        scratch: folder of the files.
         report: called with the share done.
 
     Raises:
@@ -202,7 +200,7 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
     usable = some.usable()
     if not bool(usable.any()):
         raise SceneError(
-            f"{rows.path}: none of {len(some)} Gaussians in it can be drawn: all have NaN or "
+            f"{rows.path}: none of {len(some)} sampled Gaussians can be drawn: all have NaN or "
             "infinite values"
         )
     numbers = torch.tensor(picked, **INDICES)[usable]
@@ -254,8 +252,9 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
 
 
 def _places(keys: Tensor, numbers: Tensor, count: int) -> Tensor:
-    """Places (n,) int64 on the curve, from keys on the curve and the numbers of ``count`` rows. The
-    last 21 bits hold the order in the file, so that Gaussians at one position can be parted too."""
+    """Positions (n,) int64 along the curve, from keys on the curve and the row numbers of ``count``
+    rows. The last 21 bits are the file order, so that even Gaussians at one position can be
+    separated."""
     return ((keys >> 18) << 21) | (numbers * (1 << 21) // count)
 
 

@@ -1,10 +1,9 @@
-"""Covariances of Gaussians, their projections onto planes, and the overlaps of these, in batches,
-float64.
+"""Covariances of Gaussians, their projections onto planes and overlaps; batched, float64.
 
-A symmetric 3 x 3 matrix is stored as its six numbers (xx, xy, xz, yy, yz, zz), a symmetric 2 x 2
-matrix as its three (uu, uv, vv). A picture shows the projection of a Gaussian onto a plane. So
-sizes are areas, not volumes, in units of 2 pi times squared scene units: the integral of a
-projection of peak 1 is its area.
+A symmetric 3 x 3 matrix is stored as six numbers (xx, xy, xz, yy, yz, zz), a symmetric 2 x 2 matrix
+as three (uu, uv, vv). An image shows the projection of a Gaussian onto a plane. So sizes are areas,
+not volumes, in units of 2 pi times squared scene units: the integral of a projection of peak 1 is
+its area.
 """
 
 from __future__ import annotations
@@ -19,25 +18,24 @@ from pointsplat_ns.system.pieces import in_pieces
 from pointsplat_ns.system.tensors import DOUBLES
 
 MIN_DIVISOR = 1e-300
-"""Lower bound of float64 denominators, which keeps quotients finite; the smallest normal float64 is
+"""Lower bound of float64 denominators, to keep quotients finite; the smallest normal float64 is
 2e-308."""
 
 
 def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
     """Covariances (N, 6) of Gaussians with log-scales (N, 3), +-Inf allowed, and quaternions (N,
     4), float64."""
-    logs = log_scales.clamp(
-        -40.0, 40.0
-    )  # products of four standard deviations and their squares stay in float64
-    # an axis is at least exp(-11.5), 1e-5, of the longest, which float64 still tells from zero
+    # products of four standard deviations and their squares fit into float64
+    logs = log_scales.clamp(-40.0, 40.0)
+    # an axis is at least exp(-11.5), 1e-5, of the longest, which float64 distinguishes from zero
     logs = torch.maximum(logs, logs.amax(dim=1, keepdim=True) - 11.5)
     axes = rotation_matrices(quats) * logs.exp()[:, None]
     return pack(axes @ axes.transpose(1, 2))
 
 
 def covariances_of(scene: Gaussians, rows: Tensor, compiled: bool | None = None) -> Tensor:
-    """:func:`covariances` (m, 6) of the Gaussians ``rows`` (m,) of a scene; ``compiled`` False
-    leaves it to torch."""
+    """:func:`covariances` (m, 6) of the Gaussians ``rows`` (m,) of a scene; ``compiled`` False uses
+    torch."""
     if not KERNELS.usable_for(compiled, scene.scales, scene.quats):
         return in_pieces(
             lambda some: covariances(scene.scales[some].double(), scene.quats[some].double()),
@@ -78,9 +76,9 @@ def outer(vector: Tensor) -> Tensor:
 
 
 def eigen(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3) in columns of symmetric matrices
-    (N, 3, 3) float64, on a CPU by LAPACK. A GPU has no library that is made for so many small ones,
-    and takes Jacobi rotations, in 6 sweeps: each squares the error."""
+    """Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3) in columns, of symmetric matrices
+    (N, 3, 3) float64. On a CPU by LAPACK. On a GPU, where no library is made for many small
+    matrices, by 6 sweeps of Jacobi rotations, which converge quadratically."""
     if matrices.device.type == "cpu":
         values, vectors = torch.linalg.eigh(matrices)
         return values, vectors
@@ -110,8 +108,8 @@ def inverses_and_log_determinants(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def adjugate(six: Tensor) -> Tensor:
-    """(N, 6): determinant times inverse. Its quadratic form of a unit vector is the squared area of
-    the projection along that vector."""
+    """(N, 6): determinant times inverse. Its quadratic form with a unit vector is the squared area
+    of the projection along that vector."""
     a, b, c, d, e, f = six.unbind(1)
     rows = [
         d * f - e * e,
@@ -125,7 +123,7 @@ def adjugate(six: Tensor) -> Tensor:
 
 
 def bilinear(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """u^T M v, (N,), of matrices (N, 6) and vectors (N, 3)."""
+    """u^T M v, (N,), for matrices (N, 6) and vectors (N, 3)."""
     a, b, c, d, e, f = six.unbind(1)
     ux, uy, uz = u.unbind(1)
     vx, vy, vz = v.unbind(1)
@@ -137,14 +135,14 @@ def bilinear(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 def rms_area(six: Tensor) -> Tensor:
-    """Root mean square, over all directions, of the area of the projection, (N,): the square root
-    of a third of the sum of the squared products of each two standard deviations."""
+    """Root mean square, over all directions, of the projected area, (N,): the square root of a
+    third of the sum of squared products of pairs of standard deviations."""
     sides = adjugate(six)
     return ((sides[:, 0] + sides[:, 3] + sides[:, 5]).clamp_min(0) / 3).sqrt()
 
 
 def thinnest_axes(six: Tensor) -> Tensor:
-    """Unit vectors (N, 3) near the axis of least variance; any axis if no variance is the least.
+    """Unit vectors (N, 3) near the axis of least variance; any axis if it is not unique.
 
     This axis is the dominant eigenvector of the adjugate. Squaring the matrix three times makes it
     dominate (power iteration).
@@ -180,13 +178,13 @@ def plane_axes(normal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def projected(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Covariances (N, 3) of the projections onto the planes of unit vectors ``u`` and ``v`` (N,
-    3)."""
+    """Covariances (N, 3) of the projections onto the planes of unit vectors ``u`` and ``v``
+    (N, 3)."""
     return torch.stack([bilinear(six, u, u), bilinear(six, u, v), bilinear(six, v, v)], dim=1)
 
 
 def projected_area(flat: Tensor) -> Tensor:
-    """Areas (N,) of projections with covariances (N, 3): root of the determinant."""
+    """Areas (N,) of projections with covariances (N, 3): square root of the determinant."""
     return (flat[:, 0] * flat[:, 2] - flat[:, 1] ** 2).clamp_min(0).sqrt()
 
 
@@ -195,8 +193,8 @@ def overlap(first: Tensor, second: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
     The product of two Gaussians is a Gaussian. Its integral is the product of their areas, divided
     by the area of the summed covariance, times exp(-d^2 / 2) with d the Mahalanobis distance of the
-    centres under that covariance. It is no larger than the smaller area, also where the area of the
-    sum, of projections like lines, is lost to rounding.
+    centres under that covariance. It is clamped to the smaller area, for projections like lines,
+    where the area of the sum is lost to rounding.
 
     Args:
         first, second: (N, 3) covariances of the projections.

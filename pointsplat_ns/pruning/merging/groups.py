@@ -1,9 +1,7 @@
-"""The groups of Gaussians that were merged, the scene of one Gaussian for each group, and one
-factor for their sizes.
+"""Groups of merged Gaussians, the scene of one Gaussian per group, and one factor for sizes.
 
-How large a merged Gaussian must be to look like its members depends on how these overlap and on
-what is behind them, and differs between scenes. The factor is chosen by the PSNR against renders of
-the dense scene.
+The right size of a merged Gaussian depends on the overlap of its members and on the background, and
+differs between scenes. One factor is chosen by the PSNR against renders of the dense scene.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ class Groups:
     """n participants in K groups."""
 
     group: Tensor  # [n] int64, the group of each participant
-    shares: Tensor  # [n] float32, of each participant in the mass of its group
+    shares: Tensor  # [n] float32, share of each participant in its group's mass
     means: Tensor  # [K, 3] float64, scene units
     cov: Tensor  # [K, 6] float64, squared scene units
     alphas: Tensor  # [K] float64
@@ -39,7 +37,7 @@ class Groups:
 
     @classmethod
     def of(cls, participants: Participants, state: State, rounds: Sequence[Round]) -> Groups:
-        """The groups that became the Gaussians of a state after some rounds."""
+        """The groups that form the Gaussians of a state after the rounds."""
         group = numbers(len(state), state.means.device)
         shares = torch.ones_like(state.weights)
         for place, share in reversed(rounds):
@@ -59,15 +57,14 @@ def scene_maker(
     participants: Participants, groups: Groups, settings: MergeSettings
 ) -> tuple[Tensor, Callable[[float], Gaussians]]:
     """The scene of K groups, in the order of their first members. A group of one member is that
-    member to the bit.
+    member, exact to the bit.
 
     Returns:
         The group (n,) of each participant, and a function from a size change, which is added to the
         log-scales of merged Gaussians, to the scene.
     """
-    first = groups.group.new_full(
-        (len(groups.counts),), len(participants.scene)
-    )  # index in the scene of each
+    # index of each group in the scene
+    first = groups.group.new_full((len(groups.counts),), len(participants.scene))
     first, order = first.scatter_reduce_(0, groups.group, participants.members, "amin").sort()
     rank = torch.empty_like(order)
     rank[order] = numbers(len(order), order.device)
@@ -101,7 +98,7 @@ def scene_maker(
 
 
 def deepened(alphas: Tensor, counts: Tensor, exponent: float, max_opacity: float) -> Tensor:
-    """Opacities (n,) of Gaussians of ``counts`` (n,) members: 1 - (1 - alpha)^(counts^exponent),
+    """Opacities (n,) of Gaussians with ``counts`` (n,) members: 1 - (1 - alpha)^(counts^exponent),
     their optical depth times counts^exponent."""
     depth = -torch.log1p(-alphas.clamp_max(max_opacity)) * counts.double() ** exponent
     return (-torch.expm1(-depth)).clamp_max(ALPHA_MAX)
@@ -110,8 +107,8 @@ def deepened(alphas: Tensor, counts: Tensor, exponent: float, max_opacity: float
 def _mean_sh(
     participants: Participants, group: Tensor, shares: Tensor, single: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means over the members by their ``shares``
-    (n,) of their groups (n,). Those of a group of one, ``single`` (K,), are its own to the bit."""
+    """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means over members with ``shares`` (n,) in
+    groups (n,). Groups of one, ``single`` (K,), keep theirs exact to the bit."""
     scene = participants.scene
     wide = torch.promote_types(scene.dtype, torch.float32)
     means = []
@@ -134,7 +131,7 @@ def _mean_sh(
 
 
 def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Log-scales (n, 3) float64, and quaternions (n, 4) of some dtype, of covariances (n, 6)."""
+    """Log-scales (n, 3) float64, and quaternions (n, 4) of a dtype, from covariances (n, 6)."""
     scales = cov.new_empty(len(cov), 3)
     quats = cov.new_empty(len(cov), 4, dtype=dtype)
 
@@ -146,7 +143,7 @@ def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
             .sum(1)
             .sign()[:, None]
         )
-        # as covariances(): rounding leaves nothing of what is thinner
+        # as in covariances(): rounding leaves nothing of thinner axes
         variances = torch.maximum(variances, 1e-10 * variances[:, 2:]).clamp_min(MIN_DIVISOR)
         scales[rows] = 0.5 * variances.log()
         quats[rows] = quaternions_of(axes).to(dtype)
@@ -156,9 +153,8 @@ def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
 
 
 def best_size_change(psnr_of: Callable[[float], float]) -> float:
-    """The best size change of those tried: three, and the top of the parabola through them, a
-    little outside of them at most. ``psnr_of`` gives the PSNR of the scene with a size change,
-    dB."""
+    """The best size change: of three trials, and the maximum of the parabola through them, which
+    may lie slightly outside. ``psnr_of`` returns the PSNR of the scene with a size change, dB."""
     changes = (-0.1, 0.0, 0.05)
     tried = {change: psnr_of(change) for change in changes}
     top = top_of_parabola(changes, list(tried.values()), margin=0.05)
@@ -167,8 +163,8 @@ def best_size_change(psnr_of: Callable[[float], float]) -> float:
 
 
 def top_of_parabola(at: tuple[float, float, float], values: list[float], margin: float) -> float:
-    """Where the parabola through three points is highest, at most ``margin`` outside of them. If it
-    has no top, as far out if the values only rise that way, else the best of the three.
+    """Argument of the maximum of the parabola through three points, at most ``margin`` outside of
+    them. Without a maximum, the bound on the side where the values rise, or the best of the three.
 
     Example:
         >>> round(top_of_parabola((0.0, 1.0, 3.0), [-4.0, -1.0, -1.0], margin=0.0), 6)

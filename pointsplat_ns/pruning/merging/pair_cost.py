@@ -1,27 +1,27 @@
-"""What a pair costs: the expected change of pictures when neighbours i and j are replaced by one
-Gaussian k.
+"""Cost of a pair: the expected change of images if neighbours i and j are replaced by a Gaussian k.
 
 All three are projected onto a plane, as ``a G(x)`` with opacity a, ``G(x) = exp(-x^T S^-1 x / 2)``
-and area A. Near a surface a picture is a blend, sum(a G c) / sum(a G). So a change of one Gaussian
+and area A. Near a surface an image is a blend, sum(a G c) / sum(a G). So a change of one Gaussian
 counts by its colour f relative to its surroundings, and counts less the more others cover the same
 place. Where few do, the unknown background shows through and counts as well:
 
-    cost(i, j) = W_i * sum over three directions of  g^2 (E / max(cover_i, c_min)^2 + H * 3 b^2
-    exp(-d cover_i))
+    cost(i, j) = W_i * sum over three directions of
+                 g^2 (E / max(cover_i, c_min)^2 + H * 3 b^2 exp(-d cover_i))
 
-    E       = integral of |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 + 3 c_0^2 H      change of
-    colour H       = integral of (a_i G_i + a_j G_j - a_k G_k)^2                              change
-    of cover g       = A_k / (A_i + A_j)
-    growth of the area f       = colour - surroundings_i,   f_k = w_i f_i + w_j f_j cover_i = a_i /
-    2 + sum over neighbours j of a_j <G_i, G_j> / A_i                  mean of sum(a G) over G_i
-    surroundings_i = the mean colour of that cover
+    change of colour   E = integral of |f_i a_i G_i + f_j a_j G_j - f_k a_k G_k|^2 + 3 c_0^2 H
+    change of cover    H = integral of (a_i G_i + a_j G_j - a_k G_k)^2
+    growth of area     g = A_k / (A_i + A_j)
+    contrast           f = colour - surroundings_i,   f_k = w_i f_i + w_j f_j
+    cover        cover_i = a_i / 2 + sum over neighbours j of a_j <G_i, G_j> / A_i,
+                           the mean of sum(a G) over G_i
+    surroundings_i       = the mean colour of that cover
 
 The factor g^2 is empirical. On five scenes it gains 0.2 dB at 10 % and 0.3 at 30 %, and viewers
-draw 6 % fewer Gaussians on a pixel; g^3 loses with poses.
+draw 6 % fewer Gaussians per pixel; g^3 loses with poses.
 
-W_i is the visibility weight of i. c_0 = 0.01 and b = 0.3 are contrasts that are assumed, with the
-surroundings and with the far background; c_min and d are ``min_cover`` and ``background_decay`` of
-the settings.
+W_i is the visibility weight of i. c_0 = 0.01 and b = 0.3 are assumed contrasts, with the
+surroundings and with the far background; c_min and d are the settings ``min_cover`` and
+``background_decay``.
 
 The replacement is that of :mod:`~pointsplat_ns.pruning.merging.pairs`, with areas in the plane. All
 integrals are sums of overlaps, which have a closed form:
@@ -31,9 +31,9 @@ integrals are sums of overlaps, which have a closed form:
 A_pq is the area of the summed covariance S_p + S_q, and d_pq the Mahalanobis distance of the
 centres under it.
 
-The three directions are that of the thirteen axes and diagonals of a cube in which the projection
-of i is largest, and two across. Lengths are in units of the size of the scene's content, and
-bounded such that float32 holds squares of products of four of them.
+The three directions are, of the thirteen axes and diagonals of a cube, the one in which the
+projection of i is largest, and two perpendicular to it. Lengths are in units of the size of the
+scene's content, and bounded so that squares of products of four of them fit into float32.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES, numbers
 from pointsplat_ns.system.threads import in_threads
 
 TINY = 1e-30
-"""Lower bound of float32 denominators, which keeps quotients finite; the smallest normal float32 is
+"""Lower bound of float32 denominators, to keep quotients finite; the smallest normal float32 is
 1e-38."""
 
 DIRECTIONS = torch.nn.functional.normalize(
@@ -66,8 +66,8 @@ DIRECTIONS = torch.nn.functional.normalize(
 
 
 def _perpendicular_triples() -> Tensor:
-    """Indices (13, 3) of each direction and of two more, as perpendicular to it and to each other
-    as there are."""
+    """Indices (13, 3) of each direction and two others, as close to perpendicular to it and to each
+    other as possible."""
     cosines = (DIRECTIONS @ DIRECTIONS.T).abs()
     rows = []
     for first in range(len(DIRECTIONS)):
@@ -81,8 +81,8 @@ PLANE_AXES = torch.stack(plane_axes(DIRECTIONS), dim=2)  # [13, 3, 2] of the pla
 TO_PLANE = torch.stack(
     [projected(torch.eye(6, **DOUBLES), *axes.T[:, None].expand(2, 6, 3)) for axes in PLANE_AXES]
 )
-"""For each direction the matrix from the six numbers of a covariance to the three of its
-projection, (13, 6, 3)."""
+"""Matrices (13, 6, 3), one per direction, from the six numbers of a covariance to the three of its
+projection."""
 TRIPLES = _perpendicular_triples()
 
 
@@ -93,20 +93,20 @@ def pair_costs(
     dtype: torch.dtype = torch.float32,
     compiled: bool | None = None,
 ) -> Tensor:
-    """Expected change of pictures by merging each Gaussian with each of its neighbours.
+    """Expected change of images by merging each Gaussian with each of its neighbours.
 
     Args:
         state: n Gaussians.
-        near: (n, k) indices of the neighbours of each.
+        near: (n, k) neighbour indices of each Gaussian.
         settings: of the cost and of the growth of the replacement.
         dtype: precision of the costs; torch projects Gaussians in float64.
-        compiled: False leaves it to torch; True warns if there are no kernels.
+        compiled: False uses torch; True warns if the kernels are missing.
 
     Returns:
         (n, k): squared colour units times solid angle, with the surroundings of the first of each
         pair.
     """
-    # the largest numbers of neighbours and of colour axes that the kernel is made for
+    # the kernel's maximum numbers of neighbours and of colour axes
     fits = near.shape[1] <= 8 and state.colours.shape[1] <= 8 and near.dtype == torch.int32
     if fits and dtype == torch.float32 and KERNELS.usable_for(compiled, state.means):
         return _by_kernels(state, near, settings)
@@ -127,24 +127,24 @@ def pair_costs(
         )
         costs[rows] = total * state.weights[rows, None]
 
-    in_threads(fill, pieces(len(state), device, 1 << 14), device)  # 50 MB at once
+    in_threads(fill, pieces(len(state), device, 1 << 14), device)  # 50 MB at a time
     return costs
 
 
 class Flat(NamedTuple):
-    """Projections of Gaussians, all of one shape."""
+    """Projections of Gaussians; all fields have one shape."""
 
     uu: Tensor
     uv: Tensor
     vv: Tensor
 
     def area(self) -> Tensor:
-        """Root of the determinant, in units of 2 pi."""
+        """Square root of the determinant, in units of 2 pi."""
         return (self.uu * self.vv - self.uv * self.uv).clamp_min(TINY).sqrt()
 
     def overlap(self, other: Flat, u: Tensor, v: Tensor) -> Tensor:
-        """The integral of the product of two projections whose centres are (u, v) apart; the fast
-        form of :func:`~pointsplat_ns.pruning.merging.covariance.overlap`, for covariances that are not
+        """Integral of the product of two projections whose centres are (u, v) apart; the fast form
+        of :func:`~pointsplat_ns.pruning.merging.covariance.overlap`, for covariances that are not
         nearly lines."""
         both = Flat(self.uu + other.uu, self.uv + other.uv, self.vv + other.vv)
         distance = (
@@ -164,7 +164,7 @@ def costs_in_plane(
     )
     u, v = ((means[:, :1] - means[:, 1:]) @ PLANE_AXES.to(plane.device)[plane]).to(dtype).unbind(2)
     uu, uv, vv = (cov @ TO_PLANE.to(plane.device)[plane]).to(dtype).unbind(2)
-    # float32 must tell thin projections from lines: widths are at least 0.3 % of lengths
+    # float32 must distinguish thin projections from lines: widths are at least 0.3 % of lengths
     added = 1e-5 * (uu + vv) + 1e-6**2
     both = Flat(uu + added, uv, vv + added)
     first, second = (
@@ -202,7 +202,7 @@ def costs_in_plane(
     oik = first.overlap(merged, wj * u, wj * v)
     ojk = second.overlap(merged, wi * u, wi * v)
 
-    # products of colours with that of the replacement
+    # products of colours with the replacement's colour
     ik = wi * ii + wj * ij
     jk = wj * jj + wi * ij
     gii = 0.5 * ai * mi
@@ -215,13 +215,12 @@ def costs_in_plane(
     holes = gii + gjj + gkk + gij - gik - gjk
     change = colour.clamp_min(0) / cover.clamp_min(settings.min_cover).square()
     change += holes.clamp_min(0) * (3 * 0.3**2 * torch.exp(-settings.background_decay * cover))
-    return (
-        change * (merged.area() / (first.area() + second.area())).clamp_max(100.0).square()
-    )  # points grow unbounded
+    # the growth of points is unbounded
+    return change * (merged.area() / (first.area() + second.area())).clamp_max(100.0).square()
 
 
 def _within_bounds(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Means (m, 3) and covariances (m, 6) of some Gaussians, within 1000 sizes of the content,
+    """Means (m, 3) and covariances (m, 6) of rows (m,), clamped to 1000 sizes of the content,
     float64."""
     means = state.means[rows].double().clamp_(-1e3, 1e3)
     cov = state.cov[rows].double()

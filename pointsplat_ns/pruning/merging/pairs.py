@@ -1,7 +1,6 @@
-"""The pairs of a round: which go, and what they become, one Gaussian of common mass, centre,
-covariance and colour.
+"""Selection of a round's pairs, and their replacement by Gaussians of the same moments.
 
-Each pass over the Gaussians still free takes the pairs that are the cheapest for both of their
+Each pass over the Gaussians that are still free takes the pairs that are the cheapest for both
 members.
 
 With the mass ``m = a A`` of opacity a and root mean square area A, and the shares ``w_i = m_i /
@@ -13,8 +12,8 @@ With the mass ``m = a A`` of opacity a and root mean square area A, and the shar
     opacity      a_k = (a_i P_i + a_j P_j - a_i a_j <G_i, G_j>) / P_k
 
 P is the area of the projection along the thinnest axis of S_k, and <G_i, G_j> the overlap of both
-projections, which both members cover and the replacement covers once. Where a_k is above the
-largest opacity, the area grows instead.
+projections, which both members cover and the replacement covers once. If a_k exceeds the maximum
+opacity, the area grows instead.
 """
 
 from __future__ import annotations
@@ -42,20 +41,20 @@ from pointsplat_ns.system.tensors import numbers
 from pointsplat_ns.system.threads import in_threads, in_turn
 
 NEVER = torch.iinfo(torch.int64).max
-"""Key of a pair that cannot be."""
+"""Key of an invalid pair."""
 
 
 def cheapest_pairs(
     near: Tensor, costs: Tensor, passes: int = MERGING.matching_passes
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Disjoint pairs of neighbours, the cheapest first.
+    """Disjoint pairs of neighbours, cheapest first.
 
-    Ties are broken by hashed numbers: broken by the numbers themselves, a row of equal Gaussians
-    would yield one pair a pass.
+    Ties are broken by hashed indices: with the indices themselves, a row of equal Gaussians would
+    yield one pair per pass.
 
     Args:
-        near: (n, k) int32, indices of the neighbours of each Gaussian; its own index means none.
-        costs: (n, k) float32, at least 0, of merging each with each neighbour. Where two are
+        near: (n, k) int32, neighbour indices of each Gaussian; its own index means none.
+        costs: (n, k) float32, at least 0, of merging each with each neighbour. If two are
             neighbours of each other, the mean of their two costs counts.
         passes: number of passes.
 
@@ -68,8 +67,8 @@ def cheapest_pairs(
     taken = torch.zeros(n, dtype=torch.bool, device=device)
 
     def free(number: int) -> None:
-        """Leave in a block the rows of free Gaussians with free neighbours, the least key of each,
-        and its partner."""
+        """For a block: the rows of free Gaussians with free neighbours, the least key of each, and
+        its partner."""
         rows, others, keys, *_ = blocks[number]
         keys.masked_fill_(
             taken[rows] | taken.index_select(0, others.flatten()).view(others.shape), NEVER
@@ -95,19 +94,19 @@ def cheapest_pairs(
             found.append((i, j, least[mutual]))
             taken[i] = taken[j] = True
     first, second, key = (torch.cat(parts) for parts in zip(*found, strict=True))
-    prices, order = (
-        (key >> 32).int().sort(stable=True)
-    )  # integers are sorted in a tenth of the time of floats
+    # sorting integers takes a tenth of the time of floats
+    prices, order = (key >> 32).int().sort(stable=True)
     return first[order], second[order], prices.view(torch.float32)
 
 
 def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
-    """Some Gaussians (m,) int64, their neighbours (k, m) int32, and the keys (k, m) int64 of these
-    pairs.
+    """Rows (m,) int64 of a block of Gaussians, their neighbours (k, m) int32, and the keys (k, m)
+    int64 of these pairs.
 
-    A pair is in the row of its smaller index if both are neighbours of each other. Keys are ordered
-    as the costs, whose bits are the upper half: the bits of a float32 that is not negative are
-    ordered as the float is. The lower half makes them all different."""
+    A pair of mutual neighbours is in the row of its smaller index. The upper half of a key is the
+    cost's bits, because the bits of float32 of at least 0 have the order of the floats. The lower
+    half makes all keys different.
+    """
     k = near.shape[1]
     rows = numbers(here.stop - here.start, near.device) + here.start
     slots = numbers(k, near.device)
@@ -127,16 +126,16 @@ def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
 
 
 class Round(NamedTuple):
-    """What a round made of n Gaussians."""
+    """Result of a round on n Gaussians."""
 
     place: Tensor  # [n] int32, index of the Gaussian that each became or was merged into
-    shares: Tensor  # [n] float32, of each in that one's mass
+    shares: Tensor  # [n] float32, share of each in that Gaussian's mass
 
 
 def replace_pairs(
     state: State, first: Tensor, second: Tensor, settings: MergeSettings
 ) -> tuple[State, Round]:
-    """Replace disjoint pairs, each in the place of its first member.
+    """Replace disjoint pairs; a replacement takes the place of the first member.
 
     Args:
         state: n Gaussians.
@@ -144,7 +143,7 @@ def replace_pairs(
         settings: ``max_opacity`` and ``growth_exponent``.
 
     Returns:
-        The state of n - E Gaussians, and which of the n they were.
+        The state of n - E Gaussians, and the origin of each.
     """
     stays = torch.ones_like(state.counts, dtype=torch.bool)
     stays[second] = False
@@ -189,14 +188,13 @@ def replace_pairs(
         shares[i] = share
         shares[j] = 1 - share
 
-    in_threads(
-        replace, pieces(len(first), first.device, 1 << 13), first.device
-    )  # these fit into a cache
+    # fits into a cache
+    in_threads(replace, pieces(len(first), first.device, 1 << 13), first.device)
     return after, Round(place.int(), shares)
 
 
 def growth(alphas: Tensor, settings: MergeSettings) -> Tensor:
-    """Factor of the area of Gaussians that need opacities ``alphas``, any shape; 1 up to
-    ``max_opacity``. Two Gaussians seldom need twice as much; of points without area it would be
-    infinite."""
+    """Growth factor of the area of Gaussians that need opacities ``alphas``, any shape; 1 up to
+    ``max_opacity``. Clamped, because two Gaussians seldom need twice as much, while points without
+    area would need an infinite factor."""
     return (alphas / settings.max_opacity).clamp(1, 4.0) ** settings.growth_exponent

@@ -1,17 +1,17 @@
-"""How groups are regrouped: each member changes to the group near it that it fits best.
+"""Regroups members: each member moves to the nearby group that fits it best.
 
-Pairs are merged from the bottom up and are never separated. So some members end in a group whose
-other members lie elsewhere. As in k-means, each member then changes to the group that it fits best,
-and the groups are computed anew: hard EM of a mixture of Gaussians whose data are Gaussians
-(Vasconcelos and Lippman, Learning mixture hierarchies, NIPS 1998). A member with mean mu,
-covariance S and colour c fits a group with mu_g, S_g and c_g by
+Pairs are merged bottom-up and never separated. So some members end in a group whose other members
+are elsewhere. As in k-means, each member then moves to the group that fits it best, and the groups
+are recomputed: hard EM of a mixture of Gaussians whose data are Gaussians (Vasconcelos and Lippman,
+Learning mixture hierarchies, NIPS 1998). A member with mean mu, covariance S and colour c fits a
+group with mu_g, S_g and c_g by
 
-    fit = 1/2 (tr(S_g^-1 (S + (mu - mu_g)(mu - mu_g)^T)) + log det S_g) + |c - c_g|^2 / (2
-    contrast^2)
+    fit = 1/2 (tr(S_g^-1 (S + (mu - mu_g)(mu - mu_g)^T)) + log det S_g)
+          + |c - c_g|^2 / (2 contrast^2)
 
-The less, the better: the expected negative log-density of the group over the member, and the
-difference of colour. The mass of a member, by which the moments of a group are weighted, is opacity
-times root mean square area.
+Lower is better: the expected negative log-density of the group over the member, plus the colour
+difference. A member's mass, the weight in the moments of its group, is opacity times root mean
+square area.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from pointsplat_ns.system.threads import in_threads, in_turn
 
 
 class Members:
-    """n members of groups. Of their numbers, only masses are kept: the others are computed in
-    pieces each time, which takes less memory and, by the kernel, little time.
+    """n members of groups. Only masses are stored; other properties are recomputed in pieces each
+    time, which saves memory and, with the kernel, takes little time.
 
     Args:
         scene: N Gaussians.
@@ -66,7 +66,7 @@ class Members:
         """Opacity times root mean square area, (n,)."""
 
     def pieces(self) -> list[slice]:
-        """All members, in pieces."""
+        """Slices of all members."""
         return pieces(len(self._rows), self._rows.device)
 
     def means(self, these: slice) -> Tensor:
@@ -89,7 +89,7 @@ class Moments:
     mass: Tensor  # [K] float64
     sizes: Tensor  # [K] int64, number of members
     means: Tensor  # [K, 3] float64
-    cov: Tensor  # [K, 6] float64, mean covariance of the members, and covariance of their means
+    cov: Tensor  # [K, 6] float64, mean covariance of the members plus covariance of their means
     colours: Tensor  # [K, 3] float64, of SH degree 0
 
     def shares(self, masses: Tensor, group: Tensor) -> Tensor:
@@ -103,15 +103,15 @@ class Moments:
 
 
 def regrouped(participants: Participants, groups: Groups, settings: MergeSettings) -> Groups:
-    """Groups whose members fit them better.
+    """Groups with better fitting members.
 
-    The mass of a group may differ from the sum of its members' masses, because members overlap. The
-    ratio of both is kept.
+    The mass of a group may differ from the sum of its members' masses, because members overlap.
+    Regrouping preserves the ratio of the two.
 
     Args:
         participants: n Gaussians.
-        groups: their groups, of which membership, sizes and opacities count.
-        settings: ``regrouping_rounds`` and how members choose.
+        groups: their groups; membership, sizes and opacities are used.
+        settings: ``regrouping_rounds``, and the parameters of the fit.
     """
     group = groups.group
     alphas = groups.alphas
@@ -156,7 +156,7 @@ def group_moments(members: Members, group: Tensor, count: int) -> Moments:
     Args:
         members: n members.
         group: (n,) the group of each.
-        count: number of groups, K; each has a member.
+        count: number of groups, K; none is empty.
     """
 
     def zeros(*shape: int) -> Tensor:
@@ -194,28 +194,26 @@ def best_groups(
     settings: MergeSettings = MERGING,
     compiled: bool | None = None,
 ) -> Tensor:
-    """The group (n,) that each member fits best, of its own and the six nearest. The heaviest
-    member of each group stays, so that no group is empty.
+    """The group (n,) that fits each member best, of its own and the six nearest. The heaviest
+    member of each group stays, so that no group becomes empty.
 
     Args:
         members: n members.
         group: (n,) the group of each.
         groups: moments of the groups.
         settings: ``regrouping_contrast``.
-        compiled: False leaves it to torch; True warns if there are no kernels.
+        compiled: False uses torch; True warns if the kernels are missing.
     """
     inverse = torch.empty_like(groups.cov)
     log_determinants = torch.empty_like(groups.mass)
-    occurrences = groups.cov.new_tensor(
-        [1.0, 2.0, 2.0, 1.0, 2.0, 1.0]
-    )  # of the numbers of a symmetric matrix
+    # of the six numbers of a symmetric matrix
+    occurrences = groups.cov.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
 
     def invert(some: slice) -> None:
         cov = groups.cov[some]
         variance = diagonals(cov).mean(1).clamp_min(MIN_DIVISOR)
-        shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES).to(
-            cov.device
-        )  # invertible if flat
+        # invertible even if flat
+        shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES).to(cov.device)
         inverses, logs = inverses_and_log_determinants(shapes)
         inverse[some] = pack(inverses) * (occurrences / variance[:, None])
         log_determinants[some] = logs + 3 * variance.log()

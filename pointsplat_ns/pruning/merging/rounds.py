@@ -1,10 +1,10 @@
-"""The loop of merging: rounds of pairs until the count is reached, then the scene of what remains.
+"""The main loop of merging: rounds of pairs down to the count, then the final scene.
 
-Everything is computed on the device of the scene. On a CPU, pieces of work take one thread each:
-the result is the same bits on any number of threads, and no thread waits for another within an
-operation. On a GPU, torch does without kernels and rounds in another way; where its memory is too
-small, the CPU merges. Besides the scene itself, at most 0.35 kB a Gaussian are taken; freed blocks
-are given back to the system before steps that take much.
+All steps run on the scene's device. On a CPU, pieces of work take one thread each: the result is
+exact to the bit on any number of threads, and no thread waits for another within an operation. On a
+GPU, torch works without kernels and rounds differently; if its memory is too small, the CPU merges.
+Merging takes at most 0.35 kB per Gaussian besides the scene itself; freed blocks are returned to
+the system before steps that allocate much.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ class Merged:
     """The result of merging."""
 
     scene: Gaussians
-    """K Gaussians in the order of their first members. Those not merged with any other are
-    unchanged to the bit."""
+    """K Gaussians in the order of their first members. Those that were not merged are unchanged,
+    exact to the bit."""
     # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
     assignment: Tensor
     size_change: float = 0.0
-    """Added to the log-scales of merged Gaussians, chosen by renders."""
+    """Added to the log-scales of merged Gaussians; chosen by comparing renders."""
 
     def to(self, device: torch.device) -> Merged:
-        """The same on a device."""
+        """The same result on a device."""
         return replace(self, scene=self.scene.to(device), assignment=self.assignment.to(device))
 
 
@@ -67,16 +67,16 @@ def merge(
 ) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
-    Gaussians too faint to be drawn are dropped first.
+    Gaussians that are too faint to be drawn are dropped first.
 
     Args:
-        scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable` are
-            dropped, unless ``k`` is N.
+        scene: N Gaussians. Those that cannot be drawn
+            (:meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable`) are dropped unless ``k`` is N.
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
         views: views in which the result should look the same, such as the poses of the scene's
-            photos. What none of them shows is merged first. A sampler of the same scene, or of one
-            that looks the same, samples them; by default a new one does.
+            photos. Gaussians that none of them shows are merged first. A sampler of the same scene,
+            or of one that looks the same, samples views; by default a new sampler does.
         settings: the tuned numbers.
 
     Returns:
@@ -97,22 +97,22 @@ def merge_levels(
 ) -> Iterator[Merged]:
     """Replace a scene by fewer and fewer Gaussians in one pass.
 
-    Each level is merged from the one before: Gaussians that are one in a level are one in all that
-    follow. So several levels are not regrouped, and each is a little worse than what :func:`merge`
-    makes.
+    Each level is merged from the previous one: Gaussians merged in one level stay merged in all
+    later levels. So several levels are not regrouped, and are slightly worse than results of
+    :func:`merge`.
 
     Args:
         scene: N Gaussians, see :func:`merge`.
         counts: number of Gaussians of each level, in 1..N, descending without repetition.
-        progress: called with the share done of all levels, in [0, 1].
+        progress: called with the share done over all levels, in [0, 1].
         views, settings: as for :func:`merge`.
 
     Yields:
         A level for each count, as soon as it is reached.
 
     Raises:
-        BudgetError: if a count is not in 1..N, the counts do not descend, or the first is more than
-            can be drawn.
+        BudgetError: if a count is not in 1..N, the counts do not descend, or the first exceeds the
+            number of drawable Gaussians.
     """
     n = len(scene)
     for k in counts:
@@ -126,8 +126,8 @@ def merge_levels(
 
 
 def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Result]) -> Result:
-    """The result of a function of a scene; of the scene on the CPU, if a GPU has too little memory
-    for it, or lacks float64."""
+    """Result of a function of a scene; moves the scene to the CPU if a GPU has too little memory,
+    or lacks float64."""
     if scene.device.type == "mps":
         scene = scene.to("cpu")
     try:
@@ -136,7 +136,7 @@ def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Resul
         if scene.device.type == "cpu":
             raise
         logger.warning(
-            "%s has too little memory to merge %d Gaussians: the CPU does, slower",
+            "%s has too little memory to merge %d Gaussians: using the CPU, which is slower",
             scene.device,
             len(scene),
         )
@@ -144,11 +144,10 @@ def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Resul
 
 
 class Merger:
-    """Merges one scene to several counts, each as :func:`merge` does. The views, and all rounds
-    before the last one of a count, are those of every smaller count as well, and are made once.
+    """Merges one scene to several counts, each as :func:`merge` does. Views and all but the last
+    round of a count are shared with every smaller count, and computed once.
 
-    The steps that are kept take at most 0.4 kB for each Gaussian of the scene.
-
+    The stored steps take at most 0.4 kB per Gaussian of the scene.
     Args:
         scene, views, settings: as for :func:`merge`.
     """
@@ -162,15 +161,15 @@ class Merger:
         self._scene = scene
         self._device = scene.device
         self._options = (views, settings)
-        self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
+        self._steps: list[Step] = []  # after rounds with the maximum number of pairs
 
     @torch.no_grad()
     def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
-        """The result of :func:`merge`, to the bit. Arguments and errors as there."""
+        """The result of :func:`merge`, exact to the bit. Arguments and errors as there."""
         report = progress or (lambda share: None)
 
         def on(scene: Gaussians) -> Merged:
-            if scene is not self._scene:  # it was moved, which the steps before were not
+            if scene is not self._scene:  # it was moved, unlike the earlier steps
                 self._scene = scene
                 self._steps = []
             return self._merged(k, report)
@@ -181,9 +180,8 @@ class Merger:
         views, settings = self._options
         if not self._steps and 1 <= k < len(self._scene):
             self._steps.append(first_step(self._scene, 1, views, settings, report=report))
-        if not self._steps or not 1 <= k <= len(
-            self._steps[0].state
-        ):  # faint Gaussians are among them
+        # includes faint Gaussians
+        if not self._steps or not 1 <= k <= len(self._steps[0].state):
             return merge(self._scene, k, report, views, settings)
         step = next(step for step in reversed(self._steps) if len(step.state) >= k)
         first = len(step.state)
@@ -241,17 +239,17 @@ def _share_done(first: int, now: int, last: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Everything that is known between two rounds."""
+    """State between two rounds."""
 
     participants: Participants
-    views: Views | None  # that visibility was computed in
+    views: Views | None  # used for visibility
     state: State
     rounds: tuple[Round, ...] = ()
     reference: RendersOfSizes | None = None
-    """Renders of the scene, or of what remained once it was few enough to render."""
+    """Renders of the scene, or of the remaining Gaussians once they were few enough to render."""
 
     def groups(self) -> Groups:
-        """The participants in groups, one for each Gaussian that remains."""
+        """Groups of the participants, one per remaining Gaussian."""
         return Groups.of(self.participants, self.state, self.rounds)
 
 
@@ -263,8 +261,8 @@ def first_step(
     last: int = 0,
     report: Callable[[float], None] = lambda share: None,
 ) -> Step:
-    """The step before the first round, of at least ``k`` Gaussians; ``views`` as for :func:`merge`.
-    Nothing is rendered if they are no more than the ``last`` count, so that no round follows."""
+    """The step before the first round, with at least ``k`` Gaussians; ``views`` as for
+    :func:`merge`. There are no renders if no round follows, for at most the ``last`` count."""
     with one_thread_each():
         members = drawable(scene, k)
         begin: list[Callable[[], Any]] = [lambda: Participants.of(scene, members)]
@@ -272,10 +270,10 @@ def first_step(
             if not isinstance(views, Views) and len(members) >= settings.min_count_rendered:
                 views = views or Sampler(scene)
                 begin.append(views.prepare)
-            if scene.device.type == "cpu":  # elsewhere, another tree is used
+            if scene.device.type == "cpu":  # other devices use another tree
                 begin.append(import_tree)
         participants, *_ = in_turn(lambda step: step(), begin, scene.device)
-        give_back_freed_memory()  # of threads that have ended
+        give_back_freed_memory()  # of finished threads
         found = None
         weights = torch.ones_like(participants.members, dtype=torch.float32)
         if len(participants) > last:
@@ -288,12 +286,12 @@ def first_step(
 
 
 def most_pairs(n: int, settings: MergeSettings) -> int:
-    """Largest number of pairs that a round merges of ``n`` Gaussians."""
+    """Maximum number of pairs that a round merges of ``n`` Gaussians."""
     return max(1, int(n * settings.round_share))
 
 
 def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
-    """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
+    """The step after another round; at least ``k`` Gaussians remain."""
     n = len(step.state)
     most = min(n - k, most_pairs(n, settings))
     with one_thread_each():
@@ -308,9 +306,9 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
 
 
 def _with_reference(step: Step, settings: MergeSettings) -> Step:
-    """A step with renders that results are compared with, in every few pixels of pictures of the
-    middle size (:func:`~pointsplat_ns.rendering.comparison.sizes.sides_of`), unless there are some, too many
-    Gaussians, or no views."""
+    """A step with reference renders, subsampled from images of the middle size
+    (:func:`~pointsplat_ns.rendering.comparison.sizes.sides_of`); unchanged if it has some already,
+    too many Gaussians, or no views."""
     everyone = step.participants
     views = step.views
     if (
@@ -336,7 +334,7 @@ def _with_reference(step: Step, settings: MergeSettings) -> Step:
 
 
 def _result(step: Step, regroup: bool, settings: MergeSettings) -> Merged:
-    """The result after some rounds."""
+    """The result after the last round."""
     participants = step.participants
     reference = step.reference
     with one_thread_each():

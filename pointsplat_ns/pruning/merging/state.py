@@ -1,4 +1,4 @@
-"""The Gaussians of a scene that are merged, and what a round knows of those that remain."""
+"""The participants of merging, and the state of the remaining Gaussians in a round."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from pointsplat_ns.system.threads import in_turn
 from pointsplat_ns.view_sampling.content import content_size
 
 SAMPLED = 1 << 18
-"""Largest number of Gaussians by which the curve and the borders of cells are found."""
+"""Maximum number of Gaussians that determine the curve and the borders of cells."""
 
 
 def sampled_step(count: int) -> int:
-    """Of ``count`` Gaussians, the curve and the borders of cells are found by every so many-th."""
+    """Step n such that every n-th of ``count`` Gaussians determines curve and cell borders."""
     return -(-count // SAMPLED)
 
 
 @dataclass(frozen=True, eq=False)
 class Participants:
-    """The Gaussians that are merged, and the scene that they are part of."""
+    """The Gaussians to be merged, and the scene that contains them."""
 
     scene: Gaussians  # N Gaussians; merging computes on their device
     # [n] int64, indices in the scene, along a space-filling curve: neighbours are near in memory
@@ -78,18 +78,17 @@ def drawable(scene: Gaussians, k: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The Gaussians that remain after some rounds.
+    """The Gaussians that remain after the rounds so far.
 
-    Costs are of float32, and the shapes of groups are computed anew at the end, so that more digits
-    would not show.
+    float32 is sufficient: costs are float32, and the shapes of groups are recomputed at the end.
     """
 
-    means: Tensor  # [n, 3] float32, around the centre, in units of the size
-    cov: Tensor  # [n, 6] float32, in units of the squared size, within what float32 can hold
+    means: Tensor  # [n, 3] float32, relative to the centre, in units of the size
+    cov: Tensor  # [n, 6] float32, in units of the squared size, clamped to the range of float32
     alphas: Tensor  # [n] float32
     colours: Tensor  # [n, C] float32 on principal axes, colour units
     weights: Tensor  # [n] float32, visibility weight per unit of area
-    counts: Tensor  # [n] int32, number of Gaussians that each stands for
+    counts: Tensor  # [n] int32, number of Gaussians merged into each
 
     def __len__(self) -> int:
         return len(self.means)
@@ -107,7 +106,7 @@ def initial_state(
         participants: n Gaussians of a scene.
         weights: (n,) visibility weight of each per unit of area.
         colour_axes: as of :func:`principal_axes`; by default those of the participants.
-        dtype: float64 for a reference, which kernels do not take.
+        dtype: float64 for a reference, which kernels do not support.
     """
     scene = participants.scene
     members = participants.members
@@ -137,7 +136,7 @@ def initial_state(
 
 
 def bounded_colours(coefficients: Tensor) -> Tensor:
-    """SH coefficients in colour units, float32, within bounds: a few broken colours must not hide
+    """SH coefficients in colour units, float32, clamped, so that a few broken colours do not hide
     all others."""
     return (coefficients.float() * SH_C0).clamp_(-10.0, 10.0)
 
@@ -149,17 +148,16 @@ def _coefficients(scene: Gaussians, rows: Tensor) -> Tensor:
 
 
 def principal_axes(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean of all SH coefficients of members (n,), (3 (d+1)^2,) float32, colour units, and
-    their principal axes, (3 (d+1)^2, C) float32, orthogonal, each of length 1.
+    """Mean of all SH coefficients of members (n,), (3 (d+1)^2,) float32, colour units, and their
+    principal axes, (3 (d+1)^2, C) float32, orthonormal.
 
     By Parseval's theorem, the coefficients of every band contribute to the mean square over
     directions as the constant does. Eight axes hold nearly all of the variance.
     """
     width = 3 + 3 * scene.features_rest.shape[1]
     first, *_ = parts = pieces(len(members), members.device)
-    shift = _coefficients(scene, members[first]).mean(
-        0
-    )  # near the mean, so that float32 holds the squares
+    # near the mean, so that squares fit into float32
+    shift = _coefficients(scene, members[first]).mean(0)
     total, products = (
         torch.zeros(*shape, **DOUBLES).to(members.device) for shape in ((width,), (width, width))
     )

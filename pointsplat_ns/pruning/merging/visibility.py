@@ -1,12 +1,11 @@
-"""Visibility weight of each Gaussian: the pixels that it covers per unit of its own area. Errors
-count by it.
+"""Visibility weight of each Gaussian: covered pixels per unit of its area. Weights errors.
 
-A Gaussian covers the sum over pixels of its blend weight, alpha times transmittance. Divided by its
-opacity and area, that is large near the cameras, small far away, and 0 behind a wall.
+The covered pixels of a Gaussian are the sum of its blending weight, alpha times transmittance.
+Divided by opacity and area, they are many near the cameras, few far away, and 0 behind a wall.
 
-Pictures are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would make
-Gaussians below the size of a pixel seem large. The antialiased rasterizer lowers their opacity by
-as much, so it counts right.
+Renders are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would
+overestimate Gaussians below the size of a pixel. The antialiased rasterizer lowers their opacity in
+proportion, so its count is right.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ def views_and_weights(
     settings: MergeSettings,
     report: Callable[[float], None] = lambda share: None,
 ) -> tuple[Views | None, Tensor]:
-    """The views that visibility is computed in, and the visibility weights (n,) of participants,
-    with trace factors where they count. Arguments are those of :func:`views_to_weigh` and
+    """The views for visibility, and the visibility weights (n,) of participants, multiplied by
+    trace factors if these apply. Arguments are those of :func:`views_to_weigh` and
     :func:`visibility_weights`."""
     found, traced = views_to_weigh(len(participants), views, settings)
     report(0.6)
@@ -54,17 +53,17 @@ def views_and_weights(
 def views_to_weigh(
     count: int, views: Views | Sampler | None, settings: MergeSettings
 ) -> tuple[Views | None, bool]:
-    """The views that visibility is computed in, and whether trace factors
-    (:mod:`~pointsplat_ns.view_sampling.traces`) count.
+    """The views for visibility, and whether trace factors
+    (:mod:`~pointsplat_ns.view_sampling.traces`) apply.
 
     Args:
-        count: number of Gaussians that are merged.
-        views: known views, or the sampler of those that people may have taken.
+        count: number of Gaussians to merge.
+        views: known views, or the sampler of likely ones.
         settings: ``min_count_rendered``, ``sampled_views`` and ``view_seed``.
 
     Returns:
-        No views for a small scene without known ones, if nothing is visible, or if no view is asked
-        for.
+        No views for a small scene without known ones, if nothing is visible, or if the number of
+        sampled views is 0.
     """
     if isinstance(views, Views):
         return views, False
@@ -80,8 +79,8 @@ def visibility_weights(
     settings: MergeSettings,
     report: Callable[[float], None] = lambda share: None,
 ) -> Tensor:
-    """The visibility weights (n,) of participants, by one of every so many of them along the curve;
-    1 without views.
+    """The visibility weights (n,) of participants, from every n-th one along the curve; 1 without
+    views.
 
     Args:
         participants: n Gaussians.
@@ -102,7 +101,7 @@ def visibility_weights(
 
 
 def drawn_step(count: int, settings: MergeSettings) -> int:
-    """Of ``count`` Gaussians, one of so many along the curve is drawn for all of them."""
+    """Step n such that every n-th of ``count`` Gaussians along the curve is drawn."""
     return -(-count // settings.max_count_drawn)
 
 
@@ -113,7 +112,7 @@ def covered_per_area(
     settings: MergeSettings = MERGING,
     report: Callable[[float], None] = lambda share: None,
 ) -> Tensor:
-    """Covered pixels of some Gaussians over opacity times area, relative to one that is seen well.
+    """Covered pixels of rows over opacity times area, relative to a clearly visible Gaussian.
 
     Args:
         scene: N Gaussians.
@@ -124,7 +123,7 @@ def covered_per_area(
 
     Returns:
         (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows
-        enough to tell.
+        enough Gaussians.
     """
     covered = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     small = views.spread(settings.visibility_views).resized(112)

@@ -1,1 +1,1 @@
-"""Renders of scenes beside those of the dense scene."""
+"""Compares renders of scenes with renders of the dense scene."""

@@ -1,9 +1,9 @@
 """Compares renders of a smaller scene with renders of the dense scene. No photos are needed.
 
-Every PSNR against the dense scene counts all squared error, halos included, over the pixels that
-the dense scene covers (:func:`~pointsplat_ns.metrics.psnr_of`), so that empty background does not
-make it better. SSIM counts all lost similarity over the pixels on which the dense scene draws
-anything.
+PSNR against the dense scene uses the sum of all squared errors, including halos, over the pixels
+that the dense scene covers (:func:`~pointsplat_ns.metrics.psnr_of`), so that empty background does
+not improve it. SSIM uses the sum of all lost similarity over the pixels on which the dense scene
+draws anything.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 
 LEAST_OPACITY = 0.5
-"""A pixel on which the dense scene draws counts as covered by this share at least. Most scenes have
-a mean opacity of 0.8 to 0.99 on these pixels, so the bound changes nothing there. Behind an opacity
-reset it is 0.2 to 0.3: without the bound, errors are divided by next to nothing."""
+"""Minimum coverage of a pixel on which the dense scene draws. In most scenes, mean opacity is 0.8
+to 0.99 on these pixels, so the minimum has no effect. After an opacity reset it is 0.2 to 0.3:
+without the minimum, errors would be divided by almost zero."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +32,15 @@ class Closeness:
     """Errors of a scene's renders against those of the dense scene."""
 
     errors: tuple[float, ...]
-    """Mean squared error over all pixels of each view."""
+    """Mean squared error over all pixels, for each view."""
     covered: tuple[float, ...]
-    """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
+    """Share of the pixels that the dense scene covers, in [0, 1], for each view."""
     width: int | None = None
-    """Width of the pictures, pixels; None if it is not known."""
+    """Width of the images, pixels; None if unknown."""
 
     @property
     def psnr(self) -> float:
-        """PSNR over the pixels that the dense scene covers in all views, dB; inf if nothing
-        differs."""
+        """PSNR over the pixels that the dense scene covers in all views, dB; inf for no error."""
         return psnr_of(sum(self.errors) / len(self.errors), sum(self.covered) / len(self.covered))
 
     @property
@@ -52,20 +51,20 @@ class Closeness:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Pictures of the dense scene, with which renders of other scenes are compared."""
+    """Renders of the dense scene, to compare renders of other scenes with."""
 
     views: Views
     """C views."""
     renders: list[Tensor]
-    """C pictures (H, W, 3)."""
+    """C images (H, W, 3)."""
     covered: tuple[float, ...]
-    """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
+    """Share of the pixels that the dense scene covers, in [0, 1], for each view."""
     alphas: list[Tensor] | None = None
-    """C alpha pictures (H, W, 1), for errors over two backgrounds; None for errors over the views'
-    own."""
+    """C alpha images (H, W, 1), for errors over two backgrounds; None for errors over the views'
+    own background."""
     drawn: tuple[float, ...] | None = None
-    """Share of the pixels of each view on which the dense scene draws anything, in [0, 1]; None for
-    all."""
+    """Share of the pixels on which the dense scene draws anything, in [0, 1], for each view; None
+    for all pixels."""
 
     def psnr(
         self, scene: Gaussians, progress: Callable[[float], None] | None = None
@@ -81,15 +80,15 @@ class Reference:
         return self._closeness(_drawn(scene, self.views), progress)
 
     def closeness_of(self, images: Iterable[Tensor]) -> Closeness:
-        """Errors of C pictures (H, W, 3) over the views' own background."""
+        """Errors of C images (H, W, 3) over the views' own background."""
         return self._closeness(((image, None) for image in images), None)
 
     @torch.no_grad()
     def ssim(self, scene: Gaussians) -> float:
-        """SSIM of a scene, in [-1, 1]: 1 less the lost similarity of all windows, halos beside the
-        scene included, divided by the share of pixels on which the dense scene draws anything, all
-        pixels where there are none. It is -1 where this would be less. Views must not be smaller
-        than its window."""
+        """SSIM of a scene, in [-1, 1]: 1 minus the lost similarity, summed over all windows
+        including halos beside the scene, and divided by the share of pixels on which the dense
+        scene draws anything (1 if there are none). Clamped at -1. Views must be at least as large
+        as the window."""
         total = 0.0
         for (image, _), target in zip(_drawn(scene, self.views), self.renders, strict=True):
             total += float(
@@ -105,15 +104,14 @@ class Reference:
         pictures: Iterable[tuple[Tensor, Tensor | None]],
         progress: Callable[[float], None] | None,
     ) -> Closeness:
-        """Errors of images, with their alpha where :attr:`alphas` are compared, too."""
+        """Errors of images, with their alpha if :attr:`alphas` are compared too."""
         errors: list[float] = []
         for index, ((image, alpha), target) in enumerate(zip(pictures, self.renders, strict=True)):
             apart = image.double() - target.double()
             error = float(apart.square().mean())
             if self.alphas is not None and alpha is not None:
-                other = (1 - 2 * self.views.background).to(
-                    apart
-                )  # from a background to its opposite
+                # from a background to its inverse
+                other = (1 - 2 * self.views.background).to(apart)
                 over_other = apart - (alpha - self.alphas[index]).double() * other
                 error = 0.5 * (error + float(over_other.square().mean()))
             errors.append(error)
@@ -128,9 +126,9 @@ class DenseReference(Reference):
     Args:
         dense: N Gaussians.
         views: C views.
-        both_backgrounds: errors are means over two backgrounds, the views' own and its opposite
-            (white for black): the viewer's background is unknown, and a scene that fits one may be
-            too transparent or too opaque for the other.
+        both_backgrounds: average errors over two backgrounds, the views' own and its inverse (white
+            for black). The viewer's background is unknown, and a scene that fits one background may
+            be too transparent or too opaque for another.
     """
 
     @torch.no_grad()
@@ -146,19 +144,19 @@ class DenseReference(Reference):
             drawn=shares,
         )
         self.opacities = opacities
-        """Mean opacity of all pixels of each view, in [0, 1]."""
+        """Mean opacity over all pixels, in [0, 1], for each view."""
 
     @property
     def opacity(self) -> float:
-        """Mean opacity, in [0, 1], of the pixels on which the scene draws anything; 1 if there are
-        none."""
+        """Mean opacity, in [0, 1], over the pixels on which the scene draws anything; 1 if there
+        are none."""
         assert self.drawn is not None
         return sum(self.opacities) / sum(self.drawn) if any(self.drawn) else 1.0
 
 
 def _covered(opacity: float, drawn: float) -> float:
-    """Share of the pixels that a scene covers, by the mean opacity of all pixels and the share of
-    those on which anything is drawn."""
+    """Share of the pixels that a scene covers, from the mean opacity over all pixels and the share
+    of pixels on which anything is drawn."""
     return max(opacity, LEAST_OPACITY * drawn)
 
 

@@ -1,4 +1,4 @@
-"""Renders of a few views of a scene, several at once on a CPU."""
+"""Renders of a few views of a scene, several at a time on a CPU."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def each_view(
     function: Callable[[Gaussians, View], Result],
     max_count_at_once: int = 2_000_000,
 ) -> Iterator[Result]:
-    """The results of a function of a scene and a view, for each view in order. Several views are
-    computed at once; of a scene on a GPU, one after the other in this thread.
+    """Results of a function of a scene and a view, for each view in order. On a CPU several views
+    are computed at a time; on a GPU one after the other in this thread.
 
     Args:
-        scene: the Gaussians that are rendered in each view.
+        scene: the Gaussians to render.
         views: any number of views.
-        function: function of the scene and a view; it runs without gradients.
-        max_count_at_once: largest number of Gaussians, summed over the views that are rendered at
-            once, because each render takes memory. At least two views are rendered at once.
+        function: function of the scene and a view; runs without gradients.
+        max_count_at_once: maximum number of Gaussians, summed over concurrent views, because each
+            render takes memory. At least two views are rendered at a time.
     """
     at_once = max(2, max_count_at_once // max(1, len(scene)))
 

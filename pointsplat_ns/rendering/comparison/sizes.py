@@ -1,10 +1,10 @@
-"""Pictures of several sizes, drawn in few pixels.
+"""Images of several sizes, rendered with few pixels.
 
 3DGS adds 0.3 pixels^2 to the covariance of every projected Gaussian. So a scene that is right in
-small pictures may be wrong in large ones, and the other way around. Nothing else in a pixel depends
-on the size of the picture: every k-th pixel of a large picture is the picture of k times fewer
-pixels a side, with 0.3 / k^2 in place of 0.3. Such a subsampled picture covers all that the large
-one shows, at the cost of the small one.
+small images may be wrong in large ones, and vice versa. Nothing else in a pixel depends on the
+image size: every k-th pixel of a large image is a pixel of an image with k times fewer pixels a
+side, with 0.3 / k^2 in place of 0.3. Such a subsampled image covers the same field of view as the
+large one at the cost of the small one.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 
 RESOLUTION = (1920, 1080)
-"""Width and height of sampled views, pixels: the size that most people look at."""
+"""Width and height of sampled views, pixels: a common viewing size."""
 
 SMALLEST_SIDE = 320
-"""Longer side of the smallest picture, and of subsampled ones, pixels."""
+"""Longer side of the smallest images, and of subsampled ones, pixels."""
 
 NEARER = 4
-"""Size of the pictures that stand for nearer cameras, in units of the whole size."""
+"""Size of images that represent nearer cameras, relative to the full size."""
 
 
 def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | None:
-    """Width and height of pictures, pixels, as in "1920x1080"; None stays None.
+    """Image width and height, pixels, from a text such as "1920x1080"; None stays None.
 
     Raises:
-        PointSplatError: if it is neither.
+        PointSplatError: for any other value.
 
     Example:
         >>> parse_resolution("1920x1080"), parse_resolution((640, 480))
@@ -54,13 +54,13 @@ def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | No
 
 
 def size_text(resolution: tuple[int, int]) -> str:
-    """A width and height as :func:`parse_resolution` reads them."""
+    """A width and height in the format of :func:`parse_resolution`."""
     return "x".join(map(str, resolution))
 
 
 def sides_of(width: int, height: int) -> tuple[int, ...]:
-    """Longer sides of the pictures that renders are compared in, pixels: :data:`SMALLEST_SIDE`, the
-    whole size, and their geometric mean. The whole size alone if it is no larger than the smallest.
+    """Longer sides of the images for comparisons, pixels: :data:`SMALLEST_SIDE`, the full size and
+    their geometric mean; only the full size if it is no larger than the smallest.
 
     Example:
         >>> sides_of(1920, 1080), sides_of(540, 360), sides_of(64, 48)
@@ -82,29 +82,29 @@ def middle_side(views: Views) -> int:
 
 
 def middle_sized(views: Views) -> Views:
-    """Views at their :func:`middle_side`: nearly as large as people look at, and quick to draw."""
+    """Views at their :func:`middle_side`: similar to common viewing sizes, and quick to render."""
     return views.resized(middle_side(views))
 
 
 def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
-    """Every k-th pixel of pictures of another size, k = ``side / drawn_side``.
+    """Every k-th pixel of images of another size, k = ``side / drawn_side``.
 
     Args:
         views: C views of any size.
-        side: longer side of the whole pictures, pixels. If it is larger than the views' own, the
-            pictures are as large as those of a camera that is nearer.
-        drawn_side: longer side of what is drawn, pixels; at most that of ``views``. By default
-            ``side``, and at most :data:`SMALLEST_SIDE`.
+        side: longer side of the full images, pixels. Larger than the views' own gives the images of
+            a nearer camera.
+        drawn_side: longer side of the rendered images, pixels; at most that of ``views``. By
+            default ``side``, and at most :data:`SMALLEST_SIDE`.
     """
     drawn = views.resized(min(side, SMALLEST_SIDE) if drawn_side is None else drawn_side)
     return replace(drawn, eps2d=views.eps2d * (max(drawn.width, drawn.height) / side) ** 2)
 
 
 def several_sizes(views: Views, drawn_side: int = SMALLEST_SIDE) -> tuple[Views, Views, Views]:
-    """Views to optimise on, subsampled from pictures of three sizes: their :func:`middle_side`,
-    their whole size, and :data:`NEARER` times that. By default, drawn pictures are no larger than
-    the smallest: many views teach more than many pixels of few. Without the third, a garden gains
-    0.2 dB less at 1920 pixels, and as much at 960."""
+    """Views for optimisation, subsampled from images of three sizes: their :func:`middle_side`,
+    their full size, and :data:`NEARER` times that. By default, rendered images are no larger than
+    the smallest, because many views help more than many pixels of few views. Without the third
+    size, a garden gains 0.2 dB less at 1920 pixels, and the same at 960."""
     whole = max(views.width, views.height)
     sides = middle_side(views), whole, NEARER * whole
     middle, full, nearer = (subsampled(views, side, min(side, whole, drawn_side)) for side in sides)
@@ -112,13 +112,13 @@ def several_sizes(views: Views, drawn_side: int = SMALLEST_SIDE) -> tuple[Views,
 
 
 class RendersOfSizes:
-    """Renders of a dense scene, subsampled from pictures of several sizes, with which renders of
-    other scenes are compared over two backgrounds.
+    """Renders of a dense scene, subsampled from images of several sizes, to compare renders of
+    other scenes with over two backgrounds.
 
     Args:
         dense: N Gaussians.
         views: C views of the scene.
-        sides: longer sides of the whole pictures, pixels.
+        sides: longer sides of the full images, pixels.
     """
 
     @torch.no_grad()

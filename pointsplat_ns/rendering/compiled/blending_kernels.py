@@ -1,5 +1,5 @@
-"""Blending by compiled kernels (``blending.cpp``), as :mod:`~pointsplat_ns.rendering.blocks` does
-it in torch."""
+"""Blending with compiled kernels (``blending.cpp``); :mod:`~pointsplat_ns.rendering.blocks` is the
+same in torch."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 
 class KernelTape(NamedTuple):
-    """Results of the forward pass that the backward pass needs."""
+    """Results of the forward pass for the backward pass."""
 
     before: Tensor  # [chunks, 64] transmittance in front of each chunk of a tile's list
-    blended: Tensor  # [tiles] int64, Gaussians passed before all pixels were finished
-    chunks: Tensor  # [tiles + 1] int64, where each tile's chunks start
+    blended: Tensor  # [tiles] int64, Gaussians processed before all pixels were finished
+    chunks: Tensor  # [tiles + 1] int64, start of each tile's chunks
 
 
 def inputs_of(
@@ -33,8 +33,7 @@ def inputs_of(
     colors: Tensor,
     _alpha_min: float,
 ) -> Tensor:
-    """Table of projected Gaussians as the kernels read them, (M, 6 + D): geometry, then the colours
-    (M, D)."""
+    """Table of projected Gaussians for the kernels, (M, 6 + D): geometry, then colours (M, D)."""
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
     table = colors.new_empty(count, 6 + channels)
@@ -73,15 +72,15 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
 def task_of(
     table: Tensor, grid: Grid, gaussians: Tensor, offsets: Tensor, chunks: Tensor, top: int = 0
 ) -> Struct:
-    """The task of drawing some rows of tiles, without its output.
+    """The task of drawing rows of tiles, without its output.
 
     Args:
         table: of :func:`inputs_of`.
         grid: of the image.
         gaussians: (P,) int64, rows of the table, by tile and front to back.
-        offsets: (tiles + 1,) int64, where those of each tile start.
-        chunks: (tiles + 1,) int64, where the chunks of each tile start; any where no tape is kept.
-        top: the first row of tiles.
+        offsets: (tiles + 1,) int64, start of each tile's Gaussians.
+        chunks: (tiles + 1,) int64, start of each tile's chunks; ignored without a tape.
+        top: first row of tiles.
     """
     return KERNELS.structs["Task"](
         table=table,
@@ -105,8 +104,8 @@ def task_of(
 def blend_region(
     grid: Grid, tiles: TileList, table: Tensor, image: Tensor, final: Tensor, keep_tape: bool
 ) -> KernelTape | None:
-    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape
-    if it is wanted."""
+    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); returns
+    the tape if requested."""
     library = KERNELS.library
     size = library.pointsplat_chunk()
     chunks = torch.zeros_like(tiles.offsets)
@@ -127,12 +126,12 @@ def blend_region(
 
 
 def weigh(task: Struct, pairs: Tensor, count: int) -> Tensor:
-    """Blending weight of each of ``count`` Gaussians, summed over pixels, (count,). The table of
-    the task is without colours; ``pairs`` (P,) are rows of it."""
+    """Blending weight of each of ``count`` Gaussians, summed over pixels, (count,). The task's
+    table has no colours; ``pairs`` (P,) are rows of the table."""
     sums = torch.empty(pairs.numel(), **FLOATS)
     task.fill(sums=sums)
     on_threads(len(sums) >= SEVERAL, KERNELS.library.pointsplat_weigh, task)
-    # one thread, in the order of the tiles
+    # one thread, in tile order
     return sums.new_zeros(count).index_add_(0, pairs, sums)
 
 
@@ -147,7 +146,7 @@ def differentiate_region(
     absgrad: bool,
 ) -> Tensor:
     """Moments, colour gradients and absolute gradients of the Gaussians of a table from one region,
-    (rows of the table, MOMENTS + D [+ 2]); any numbers for those that are not in the tiles'
+    (rows of the table, MOMENTS + D [+ 2]); undefined for Gaussians that are not in the tiles'
     order."""
     library = KERNELS.library
     pairs = tiles.gaussians.numel()
@@ -167,7 +166,7 @@ def differentiate_region(
     )
     on_threads(pairs >= SEVERAL, library.pointsplat_differentiate, task)
 
-    # the sum of each Gaussian's pairs, in the order of its tiles
+    # the sum of each Gaussian's pairs, in tile order
     by_gaussian = torch.empty_like(tiles.places)
     by_gaussian.index_copy_(0, tiles.places, torch.arange(pairs, **INDICES))
     starts = torch.zeros(count + 1, **INDICES)

@@ -1,5 +1,5 @@
-"""The tiles that each Gaussian touches, by compiled kernels (``tiles.cpp``), as
-:mod:`~pointsplat_ns.rendering.ellipses` finds them."""
+"""Tiles that Gaussians touch, with compiled kernels (``tiles.cpp``);
+:mod:`~pointsplat_ns.rendering.ellipses` is the same in torch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pointsplat_ns.system.tensors import INDICES
 
 
 def by_depth(depths: Tensor) -> Tensor:
-    """As :func:`pointsplat_ns.rendering.ellipses.by_depth`, of depths that are not negative."""
+    """As :func:`pointsplat_ns.rendering.ellipses.by_depth`, for depths of at least 0."""
     order = torch.empty(len(depths), **INDICES)
     KERNELS.library.pointsplat_by_depth(depths, len(depths), order)
     return order
@@ -33,8 +33,7 @@ def ellipses_of(
 
 
 def boxed(table: Tensor, order: Tensor, grid: Grid) -> Ellipses:
-    """The ellipses of the Gaussians in some rows of a table, ``order``, (M,) int64, front to
-    back."""
+    """Ellipses of the Gaussians in the rows ``order``, (M,) int64, of a table, front to back."""
     found = Ellipses(order, table, torch.empty(len(order), 4, dtype=torch.int32, device="cpu"))
     on_threads(
         len(order) >= SEVERAL, KERNELS.library.pointsplat_boxes, _task(found, grid, 0, grid.rows)
@@ -69,7 +68,7 @@ def listed(
     most_pairs: float = math.inf,
 ) -> TileList | None:
     """As :func:`pointsplat_ns.rendering.ellipses.pairs_of`; without ``places`` and ``counts``,
-    which only gradients need, unless it is ``taped``; None if there are more than ``most_pairs``
+    which only gradients need, unless ``taped``; None if there are more than ``most_pairs``
     pairs."""
     first = ellipses.boxes[:, 0].clamp_min(top)
     last = ellipses.boxes[:, 1].clamp_max(bottom - 1)

@@ -1,6 +1,6 @@
-"""Readers of files of cameras: poses and intrinsics that others wrote, as views.
+"""Readers of camera files: poses and intrinsics in COLMAP's, nerfstudio's and INRIA's formats.
 
-Every file may come from a stranger: it is read within limits, and refused in one line.
+Camera files are untrusted: sizes are limited, and errors are one line.
 """
 
 from __future__ import annotations
@@ -35,38 +35,35 @@ CAMERA_KINDS = (
 
 @dataclass(frozen=True, eq=False)
 class NamedViews:
-    """Views of a file of cameras, and where their photos may lie."""
+    """Views of a camera file, and the folders of their photos."""
 
     views: Views
-    """float64 on the CPU, over black, in the order of the names of their photos."""
+    """float64 on the CPU, black background, ordered by photo name."""
     folders: Sequence[Path]
-    """Where photos may lie: beside the file, in ScanNet++'s folder of photos, or for a COLMAP model
-    in the folders ``images`` of the project."""
+    """Folders searched for photos: the file's own, ScanNet++'s photo folder, or ``images`` of the
+    COLMAP project."""
     cameras: Sequence[Camera]
-    """As the file has them, in the order of the views."""
+    """As read from the file, in the order of the views."""
     saved: Motion | None
-    """The motion of the dataset's world before the file was saved, see
-    :class:`~cameras.CameraFile`."""
+    """Transform already applied to the dataset's world, see :class:`~cameras.CameraFile`."""
     motion: Motion | None
-    """What moved the poses of the file into the frame of the scene; None if nothing did."""
+    """File whose transform moved the poses into the scene frame; None if none did."""
 
     @property
     def names(self) -> list[str]:
-        """Of the photo of each view, as the file has it; empty if it has none."""
+        """Photo name of each view, as written in the file; empty if it has none."""
         return [camera.name for camera in self.cameras]
 
     @property
     def in_scene_frame(self) -> bool:
-        """Whether the format of the file says that its poses are in the frame of a trained
-        scene."""
+        """Whether the file format defines its poses in the frame of a trained scene."""
         return self.saved is None
 
     def photo(self, index: int) -> Path | None:
-        """The photo of a view; None if it does not lie in one of the folders or below."""
+        """The photo of a view; None if it is not in or below one of the folders."""
         relative = PurePosixPath(self.names[index] if "\0" not in self.names[index] else "")
-        if (
-            not relative.name or relative.is_absolute() or ".." in relative.parts
-        ):  # nothing outside is opened
+        # never opens files outside of the folders
+        if not relative.name or relative.is_absolute() or ".." in relative.parts:
             return None
         found = (
             folder / f"{relative}{suffix}" for folder in self.folders for suffix in ("", ".png")
@@ -77,8 +74,8 @@ class NamedViews:
 
 
 def is_camera_file(path: Path | str) -> bool:
-    """Whether a path is no run and no scene, so that it can only hold cameras. The content of a
-    file is not read."""
+    """Whether a path can only be a camera file, because it is neither a run nor a scene. Does not
+    read the file."""
     path = Path(path)
     if path.is_dir():
         return model_folder(path) is not None or not any(
@@ -88,9 +85,9 @@ def is_camera_file(path: Path | str) -> bool:
 
 
 def camera_files_near(scene: Path) -> list[Path]:
-    """Files of cameras and COLMAP projects where training programs leave them: beside the file of a
-    scene, the folder of a training of 3DGS above ``point_cloud/iteration_N``, and a COLMAP project
-    that holds the file or its folder."""
+    """Camera files and COLMAP projects at the usual places near a scene: beside the file, in the
+    3DGS training folder above ``point_cloud/iteration_N``, and the COLMAP project that contains the
+    file or its folder."""
     folder = scene.absolute().parent
     roots = [folder.parents[1]] if folder.parent.name == "point_cloud" else []
     files = [root / "cameras.json" for root in (*roots, folder)]
@@ -102,8 +99,7 @@ def camera_files_near(scene: Path) -> list[Path]:
 
 
 def transforms_beside(path: Path | str) -> Path | None:
-    """The ``dataparser_transforms.json`` in a folder, or beside a file or folder; None if there is
-    none."""
+    """The ``dataparser_transforms.json`` in a folder, or beside a path; None if there is none."""
     path = Path(path)
     places = (path / RUN_FILES.transforms, path.parent / RUN_FILES.transforms)
     return next((place for place in places if place.is_file()), None)
@@ -112,20 +108,20 @@ def transforms_beside(path: Path | str) -> Path | None:
 def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedViews:
     """Read the cameras of a file.
 
-    Lens distortion is ignored, which is logged. Cameras whose pictures have another size than most
-    get that size: they see the same field of view, by other focal lengths.
+    Lens distortion is ignored; a warning is logged. Cameras of another image size than the most
+    common one get that size: same field of view, other focal lengths.
 
     Args:
         path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json`` or its folder, or the
             folder of a COLMAP model or project.
-        transforms: the ``dataparser_transforms.json`` of the run that the scene is from: it moves
-            poses of ``transforms.json`` and of COLMAP into the frame of the scene. By default the
-            one beside ``path``, if there is one. Poses of ``cameras.json`` are in the scene's frame
-            already.
+        transforms: the ``dataparser_transforms.json`` of the scene's run. It moves poses of
+            ``transforms.json`` and of COLMAP into the scene frame. By default the one beside
+            ``path``, if there is one. Poses of ``cameras.json`` are already in the scene frame.
 
     Raises:
-        SceneError: if there is no such file, or the transforms are not usable.
-        DataError: if the file is none of these, too large or damaged, or a camera is not usable.
+        SceneError: if the file is missing, or the transforms are not usable.
+        DataError: if the file has another format, is too large or damaged, or has an unusable
+            camera.
 
     Example:
         >>> import json, tempfile, torch
@@ -155,7 +151,7 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
     if found.saved is not None and transforms is not None:
         transform, scale = read_transforms(transforms)
         exact = rigid(transform.double()[None], f"{transforms}: its transform")[0]
-        logger.info("%s: poses are moved into the frame of the scene, as %s says", path, transforms)
+        logger.info("%s: poses moved into the frame of the scene by %s", path, transforms)
         motion = found.saved.undone_before(Motion(exact, scale))
     order = photo_order([camera.name for camera in found.cameras])
     views = checked_views(path, found.cameras, motion)[order]
@@ -165,23 +161,21 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
 
 
 def _json_cameras(path: Path) -> CameraFile:
-    """The cameras of a JSON file: a list is INRIA's, an object with frames nerfstudio's."""
+    """The cameras of a JSON file: a list is INRIA's, an object with ``frames`` nerfstudio's."""
     if path.is_dir():
         raise DataError(
-            f"{path}: a folder without cameras.bin or cameras.txt, there or in sparse/0; expected "
+            f"{path}: no cameras.bin or cameras.txt in the folder or its sparse/0; expected "
             f"{CAMERA_KINDS}"
         )
     path = require_file(path, CAMERA_KINDS)
-    # 100,000 frames have about as much
+    # about the size of 100,000 frames
     size = path.stat().st_size
     most = 64_000_000
     if size > most:
         raise DataError(
             f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {most / 1e6:.0f} MB"
         )
-    require_memory(
-        path, 24 * size
-    )  # most memory that a byte of JSON takes: empty lists are the worst
+    require_memory(path, 24 * size)  # worst case of memory per byte of JSON: empty lists
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
@@ -193,5 +187,5 @@ def _json_cameras(path: Path) -> CameraFile:
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         return nerfstudio_cameras(content, path)
     if isinstance(content, dict) and "camera_path" in content:
-        raise DataError(f"{path}: a path for `ns-render camera-path`; expected {CAMERA_KINDS}")
+        raise DataError(f"{path}: camera path of `ns-render`; expected {CAMERA_KINDS}")
     raise DataError(f"{path}: JSON without a list of cameras; expected {CAMERA_KINDS}")

@@ -1,4 +1,4 @@
-"""The cameras of a file, checked and made views of one size."""
+"""Checks the cameras of a file and converts them to views of one size."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 MOST_CAMERAS = 100_000
-"""Largest number of cameras in a file."""
+"""Maximum number of cameras in a file."""
 
 
 class Camera(NamedTuple):
-    """One camera as a file has it, unchecked."""
+    """One camera as read from a file, unchecked."""
 
     name: str
-    """Of its photo; empty if the file has none."""
+    """Name of its photo; empty if the file has none."""
     pose: Sequence[float]
-    """16 numbers of the 4 x 4 matrix from camera to world, row by row; OpenCV axes (x right, y
-    down, z forward)."""
+    """4 x 4 camera-to-world matrix, 16 numbers, row-major; OpenCV axes (x right, y down, z
+    forward)."""
     size: tuple[float, float]
     """Width and height, pixels."""
     focal: tuple[float, float]
     """fx and fy, pixels."""
     centre: tuple[float, float]
-    """Principal point, pixels, the first pixel's centre at (0.5, 0.5)."""
+    """Principal point, pixels; the centre of the first pixel is (0.5, 0.5)."""
     model: str = "PINHOLE"
-    """COLMAP's name of the camera model."""
+    """COLMAP name of the camera model."""
     distortion: tuple[float, ...] = ()
-    """Its parameters after the principal point."""
+    """Distortion parameters, in COLMAP's order."""
     mask: str = ""
-    """Name of the file of the pixels that count; empty if all do."""
+    """File name of the mask of valid pixels; empty if all are valid."""
 
     @property
     def bent(self) -> bool:
@@ -51,22 +51,22 @@ class Camera(NamedTuple):
 
 @dataclass(frozen=True)
 class Motion:
-    """A rigid transform of a world, and then a scale, as nerfstudio applies them to a dataset."""
+    """A rigid transform of a world followed by a scale, as nerfstudio applies them to a dataset."""
 
     transform: Tensor  # [3, 4] float64, rigid
     scale: float = 1.0
-    """Of positions, after the transform."""
+    """Scale of positions, applied after the transform."""
 
     def of(self, poses: Tensor) -> Tensor:
-        """Poses (C, 4, 4) from camera to world, moved."""
+        """Camera-to-world poses (C, 4, 4) after this motion."""
         moved = poses.clone()
         moved[:, :3] = self.transform[:, :3] @ poses[:, :3]
         moved[:, :3, 3] = (moved[:, :3, 3] + self.transform[:, 3]) * self.scale
         return moved
 
     def undone_before(self, other: Motion) -> Motion:
-        """The motion that undoes this one and then does ``other``, as nerfstudio composes them:
-        scales apart from transforms."""
+        """The inverse of this motion followed by ``other``; as in nerfstudio, transforms and scales
+        are composed separately."""
         back = invert_rigid(self.transform[None])[0]
         last = other.transform.new_tensor([[0.0, 0.0, 0.0, 1.0]])
         return Motion((torch.cat([other.transform, last]) @ back)[:3], other.scale / self.scale)
@@ -78,12 +78,12 @@ class CameraFile:
 
     cameras: Sequence[Camera]
     saved: Motion | None = None
-    """The motion that was applied to the original world before the file was saved; None if the
-    file's world is no dataset's, so that no ``dataparser_transforms.json`` is about it."""
+    """Motion applied to the dataset's original world before the file was saved; None if no
+    ``dataparser_transforms.json`` refers to the file's world."""
 
 
 def finite(value: Any) -> float | None:
-    """A finite number of JSON; None for anything else."""
+    """A finite number in JSON; None for any other value."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
@@ -94,7 +94,7 @@ def finite(value: Any) -> float | None:
 
 
 def matrix(values: Any, rows: tuple[int, ...], columns: int) -> list[list[float]] | None:
-    """A matrix of JSON, as a list of rows. Numbers that are not finite are NaN; None if it has
+    """A JSON matrix as a list of rows, with NaN for numbers that are not finite; None if it has
     another shape."""
     if not isinstance(values, list) or len(values) not in rows:
         return None
@@ -105,16 +105,16 @@ def matrix(values: Any, rows: tuple[int, ...], columns: int) -> list[list[float]
 
 
 def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
-    """Rigid motions (C, 3 or 4, 4) float64, with rotations that are orthonormal up to the last bit.
+    """Rigid motions (C, 3 or 4, 4) float64, with rotations orthonormal to the last bit.
 
     Args:
-        values: as they were read.
-        whose: the text that an error begins with.
-        names: of the photos, if these are poses of cameras; an error then names the first wrong
-            one.
+        values: matrices as read from the file.
+        whose: start of the error message.
+        names: photo names, if the matrices are camera poses; the error then names the first bad
+            camera.
 
     Raises:
-        DataError: if a number is not finite, or a matrix is no rigid motion.
+        DataError: if a number is not finite, or a matrix is not a rigid motion.
     """
     turn = values[:, :3, :3]
     off = (
@@ -122,17 +122,16 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
         .abs()
         .amax((1, 2))
     )
-    most = 1e-3  # text of four digits is off by less
-    good = (
-        values.isfinite().all(2).all(1) & (off <= most) & (torch.linalg.det(turn) > 0)
-    )  # NaN fails too
+    most = 1e-3  # four printed digits stay below this error
+    # False for NaN too
+    good = values.isfinite().all(2).all(1) & (off <= most) & (torch.linalg.det(turn) > 0)
     if values.shape[1] == 4:
         good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= most).all(1)
     if not bool(good.all()):
         camera = f" of camera {_first_bad(good, names)}" if names else ""
         raise DataError(
-            f"{whose}{camera} is no rigid motion; expected a rotation (no scale, no mirror) and a "
-            "position, all finite; correct it or leave it out"
+            f"{whose}{camera} is not a rigid motion; expected a rotation (no scale, no mirror) and "
+            "a position, all finite; correct it or leave it out"
         )
     u, _, vh = torch.linalg.svd(turn)
     exact = values.clone()
@@ -141,22 +140,21 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
 
 
 def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None) -> Views:
-    """Cameras as views over black.
+    """Convert cameras to views with a black background.
 
-    Views have one size. Cameras of another size than the most common one see the same field of view
-    at that size: their intrinsics are stretched, width and height each by itself.
+    All views have one size. Cameras of another size than the most common one keep their field of
+    view: their intrinsics are stretched to that size, width and height separately.
 
     Args:
-        path: of the file, for errors.
-        cameras: what it has.
-        motion: what moves its world to the scene's; None for nothing.
-
+        path: camera file, for error messages.
+        cameras: cameras of the file.
+        motion: moves the file's world to the scene's; None if they are the same.
     Returns:
         C views, float64 on the CPU.
 
     Raises:
-        DataError: if there is no camera, there are too many, or one is none; the text has its index
-            in the file.
+        DataError: if there is no camera, there are too many, or one is invalid; the message gives
+            its index in the file.
     """
     need_count(path, len(cameras))
     names = [camera.name for camera in cameras]
@@ -168,19 +166,16 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None) 
         torch.tensor([camera[field] for camera in cameras], **DOUBLES).view(-1, 2)
         for field in (2, 3, 4)
     )
-    reached = poses[:, :3, 3].abs().amax(1) <= 1e9  # squares of it are numbers in float32
+    reached = poses[:, :3, 3].abs().amax(1) <= 1e9  # squares stay finite in float32
     whole = ((sizes == sizes.floor()) & (sizes >= 1) & (sizes <= 100_000)).all(1)
-    long = ((focals >= 1e-3 * sizes) & (focals <= 1e5 * sizes)).all(
-        1
-    )  # fields of view of 179.9 and 0.0006 degrees
-    near = (centres.abs() <= 100.0 * sizes).all(
-        1
-    )  # at most 100 sides of the picture away from its corner
+    # fields of view of 179.9 and 0.0006 degrees
+    long = ((focals >= 1e-3 * sizes) & (focals <= 1e5 * sizes)).all(1)
+    near = (centres.abs() <= 100.0 * sizes).all(1)  # at most 100 image sizes from the corner
     for good, what, expected in (
         (reached, "is too far away", "at most 1e9 units"),
-        (whole, "has a picture of no usable size", "1 to 100,000 pixels a side"),
+        (whole, "has an unusable image size", "1 to 100,000 pixels a side"),
         (long, "has no usable focal length", "a positive number of pixels"),
-        (near, "has its principal point far outside of the picture", "one in or near it"),
+        (near, "has its principal point far outside of the image", "one in or near it"),
     ):
         if not bool(good.all()):
             camera = _first_bad(good, names)
@@ -197,8 +192,8 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None) 
 
 
 def photo_order(names: Sequence[str]) -> list[int]:
-    """Indices of cameras in the order of the names of their photos, r_2 before r_10; as they are if
-    one has no name."""
+    """Camera indices in natural order of photo names, r_2 before r_10; unchanged if a name is
+    missing."""
     order = list(range(len(names)))
     if all(names):
         order.sort(
@@ -208,13 +203,12 @@ def photo_order(names: Sequence[str]) -> list[int]:
 
 
 def need_count(path: Path, count: int) -> None:
-    """Raise a DataError for a file of no camera, or of too many."""
+    """Raise a DataError if a file has no camera, or too many."""
     if not 0 < count <= MOST_CAMERAS:
         raise DataError(f"{path}: {count} cameras; expected 1 to {MOST_CAMERAS}")
 
 
 def _first_bad(good: Tensor, names: Sequence[str]) -> str:
-    """Index of the first camera that is not ``good`` (C,), with the name of its photo if it has
-    one."""
+    """Index of the first camera that is not ``good`` (C,), with its photo name if it has one."""
     index = int((~good).nonzero()[0])
     return f"{index} ({names[index][:60]})" if names[index] else f"{index}"

@@ -1,12 +1,10 @@
-"""A COLMAP model: a folder with ``cameras.bin`` and ``images.bin``, or ``cameras.txt`` and
-``images.txt``.
+"""COLMAP models: folders with ``cameras.bin`` and ``images.bin``, or both as ``.txt``.
 
-Poses are from world to camera: a quaternion wxyz and a translation, OpenCV axes. Of a camera's
-parameters the focal lengths, the principal point and the distortion are taken. Points of images are
-skipped and never held in memory.
+Poses are world-to-camera: a quaternion wxyz and a translation, OpenCV axes. Focal lengths,
+principal point and distortion are read from a camera's parameters. The 2D points of images are
+skipped without loading them.
 
-Source: the format as https://colmap.github.io/format.html and COLMAP's own list of camera models
-define it.
+Source: https://colmap.github.io/format.html and COLMAP's list of camera models.
 """
 
 from __future__ import annotations
@@ -52,12 +50,12 @@ COLMAP_CAMERAS = {
     "FISHEYE": (15, 2, 4),
     "EUCM": (16, 2, 6),
 }
-"""Number in binary files, number of focal lengths, and number of parameters of COLMAP's camera
-models. The principal point follows the focal lengths, and the distortion that."""
+"""COLMAP's camera models: number in binary files, number of focal lengths, number of parameters.
+The parameters are focal lengths, principal point, distortion, in this order."""
 
 _LONGEST_LINE = 4096
-"""Of a camera or an image, bytes; also of the name of a photo. Lines of points are longer, and
-skipped in pieces."""
+"""Maximum length of a camera or image line and of a photo name, bytes. Lines of points are longer;
+they are skipped in pieces."""
 
 
 class _Image(NamedTuple):
@@ -68,9 +66,9 @@ class _Image(NamedTuple):
 
 
 def model_folder(path: Path) -> Path | None:
-    """The folder of a COLMAP model: of one of the two files in it, its own, that of all models
-    (``sparse``), or that of a project, with ``sparse/0`` or ``colmap/sparse/0`` in it. None if
-    there is no model."""
+    """The folder of a COLMAP model. ``path`` is one of its two files, the folder itself, the folder
+    of all models (``sparse``), or a project with ``sparse/0`` or ``colmap/sparse/0``. None if there
+    is no model."""
     files = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
     if not path.is_dir():
         return path.parent if path.name in files and path.is_file() else None
@@ -88,7 +86,7 @@ def colmap_cameras(path: Path) -> CameraFile:
         others := [place.name for place in folder.parent.glob("[1-9]*") if model_folder(place)]
     ):
         logger.warning(
-            "%s: one of several models; not read: %s", folder, ", ".join(sorted(others)[:4])
+            "%s: one of several models; skipped: %s", folder, ", ".join(sorted(others)[:4])
         )
     kind = next((kind for kind in ("bin", "txt") if (folder / f"images.{kind}").is_file()), "bin")
     cameras_path = folder / f"cameras.{kind}"
@@ -115,13 +113,13 @@ def colmap_cameras(path: Path) -> CameraFile:
     lost = next((image for image in images if image.camera not in lenses), None)
     if lost is not None:
         raise DataError(
-            f"{images_path}: {lost.name[:60]} was taken by camera {lost.camera}, which "
-            f"{cameras_path.name} lacks; expected two files of one model"
+            f"{images_path}: {lost.name[:60]} refers to camera {lost.camera}, which is missing in "
+            f"{cameras_path.name}; expected two files of one model"
         )
     poses = torch.tensor([image.pose for image in images], **DOUBLES)
     matrices = invert_rigid(torch.cat([rotation_matrices(poses[:, :4]), poses[:, 4:, None]], dim=2))
-    # The length of a quaternion is free, within what can be squared. Others become NaN, which is
-    # refused with its name.
+    # Quaternions have any length whose square is finite. Others become NaN, and the error names
+    # their image.
     lengths = poses[:, :4].norm(dim=1)
     matrices[~((lengths > 1e-6) & (lengths < 1e6))] = torch.nan
     cameras = [
@@ -132,8 +130,8 @@ def colmap_cameras(path: Path) -> CameraFile:
 
 
 def colmap_points(path: Path) -> Tensor | None:
-    """Positions (N, 3), float64, of the points of a COLMAP model, ``path`` as for
-    :func:`model_folder`; None if there are none that can be read, or more than five million."""
+    """Positions (N, 3), float64, of the 3D points of a COLMAP model, ``path`` as for
+    :func:`model_folder`; None if there are no readable points, or more than five million."""
     folder = model_folder(path) or path
     most = 5_000_000
     for kind, read in (("bin", _binary_points), ("txt", _text_points)):
@@ -152,8 +150,7 @@ def colmap_points(path: Path) -> Tensor | None:
 
 
 def _binary_points(stream: BinaryIO, path: Path) -> Iterator[tuple[float, ...]]:
-    """A count, and for each point its number, position, colour, error, and track, after its
-    length."""
+    """A count, then for each point its number, position, colour, error, track length and track."""
     count = struct.unpack("<Q", _exactly(stream, 8, path))[0]
     for _ in range(count):
         _, x, y, z, *_, seen = struct.unpack("<Q3d3BdQ", _exactly(stream, 51, path))
@@ -162,7 +159,7 @@ def _binary_points(stream: BinaryIO, path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _text_points(stream: BinaryIO, path: Path) -> Iterator[tuple[float, ...]]:
-    """The lines "POINT3D_ID X Y Z R G B ERROR TRACK[]", which may be long."""
+    """The lines "POINT3D_ID X Y Z R G B ERROR TRACK[]", of any length."""
     begins = True
     while line := stream.readline(_LONGEST_LINE):
         if begins and not line.startswith(b"#") and line.strip():
@@ -171,7 +168,7 @@ def _text_points(stream: BinaryIO, path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> Camera:
-    """A camera of COLMAP, without a photo and a pose: what took some of the images."""
+    """A COLMAP camera, shared by several images: without a photo and a pose."""
     _, focals, _ = COLMAP_CAMERAS[name]
     focal = (params[0], params[focals - 1])
     centre = (params[focals], params[focals + 1])
@@ -194,7 +191,7 @@ def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, Camera]:
             lenses[int(words[0])] = _lens(name, size, params)
         except (ValueError, IndexError) as error:
             raise DataError(
-                f"{path}: {line[:60]!r} is no camera; expected a number, a model, width, height "
+                f"{path}: {line[:60]!r} is not a camera; expected a number, a model, width, height "
                 "and parameters"
             ) from error
         need_count(path, len(lenses))
@@ -202,8 +199,8 @@ def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, Camera]:
 
 
 def _text_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
-    """The lines "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME". After each comes a line of points,
-    empty or not."""
+    """The lines "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", each followed by a line of points,
+    which may be empty."""
     for count, line in enumerate(_lines(stream, path), 1):
         need_count(path, count)
         words = line.split(maxsplit=9)
@@ -211,8 +208,8 @@ def _text_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
             image = _Image(words[9], tuple(float(word) for word in words[1:8]), int(words[8]))
         except (ValueError, IndexError) as error:
             raise DataError(
-                f"{path}: {line[:60]!r} is no image; expected a number, a quaternion wxyz, a "
-                "translation, a camera and a name, and a line of points after it"
+                f"{path}: {line[:60]!r} is not an image; expected a number, a quaternion wxyz, a "
+                "translation, a camera and a name, followed by a line of points"
             ) from error
         yield image
         while (piece := stream.readline(1 << 16)) and not piece.endswith(b"\n"):
@@ -236,7 +233,7 @@ def _lines(stream: BinaryIO, path: Path) -> Iterator[str]:
 
 
 def _binary_lenses(stream: BinaryIO, path: Path) -> dict[int, Camera]:
-    """A count, and for each camera its number, model, width, height and parameters."""
+    """A count, then for each camera its number, model, width, height and parameters."""
     names = {number: name for name, (number, _, _) in COLMAP_CAMERAS.items()}
     lenses = {}
     for _ in range(_count(stream, path, 24)):
@@ -252,8 +249,8 @@ def _binary_lenses(stream: BinaryIO, path: Path) -> dict[int, Camera]:
 
 
 def _binary_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
-    """A count, and for each image its number, quaternion, translation, camera, name (ended by 0)
-    and points, after their count."""
+    """A count, then for each image its number, quaternion, translation, camera, zero-terminated
+    name, number of points and points."""
     total = os.fstat(stream.fileno()).st_size
     for _ in range(_count(stream, path, 73)):
         _, *pose, camera = struct.unpack("<I7dI", _exactly(stream, 64, path))
@@ -261,30 +258,30 @@ def _binary_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
         name, end, _ = stream.read(_LONGEST_LINE).partition(b"\0")
         if not end:
             raise DataError(
-                f"{path}: no end of an image's name within {_LONGEST_LINE} bytes; expected a "
-                "COLMAP model"
+                f"{path}: image name does not end within {_LONGEST_LINE} bytes; expected a COLMAP "
+                "model"
             )
         stream.seek(start + len(name) + 1)
         (points,) = struct.unpack("<Q", _exactly(stream, 8, path))
-        size = 24 * points  # of each x, y and the number of its 3D point
+        size = 24 * points  # x, y and the 3D point's number
         if size > total - stream.tell():
             raise DataError(
-                f"{path}: an image with {points} points, for which the file has no room; it is "
-                "damaged or incomplete"
+                f"{path}: declares an image with {points} points, more than the file has room for; "
+                "it is damaged or incomplete"
             )
         stream.seek(size, os.SEEK_CUR)
         yield _Image(name.decode("utf-8", "replace"), tuple(pose), camera)
 
 
 def _count(stream: BinaryIO, path: Path, least: int) -> int:
-    """The count that a binary file begins with, checked against its size; ``least`` bytes follow
-    for each."""
+    """The count at the start of a binary file, checked against the file size; an entry has at least
+    ``least`` bytes."""
     (count,) = struct.unpack("<Q", _exactly(stream, 8, path))
     room = (os.fstat(stream.fileno()).st_size - 8) // least
     if not 0 < count <= min(room, MOST_CAMERAS):
         raise DataError(
-            f"{path}: says that it has {count} entries and has room for {room}; expected 1 to "
-            f"{MOST_CAMERAS}, as COLMAP writes them"
+            f"{path}: declares {count} entries, has room for {room}; expected 1 to {MOST_CAMERAS}, "
+            "as COLMAP writes them"
         )
     return count
 

@@ -1,15 +1,16 @@
-"""Cameras in JSON: nerfstudio's ``transforms.json``, and INRIA's ``cameras.json``.
+"""Cameras in JSON: ``transforms.json`` of nerfstudio and ``cameras.json`` of INRIA.
 
-``transforms.json`` is that of nerfstudio and instant-ngp. ``frames`` have ``transform_matrix``,
-from camera to world, OpenGL axes (x right, y up, z back). ``fl_x``, ``fl_y``, ``cx``, ``cy``,
-``w``, ``h`` and the distortion stand in each frame or once for all; for focal lengths there may be
-``camera_angle_x``, the horizontal field of view in radians. ``applied_transform`` (3 x 4) and
-``applied_scale`` say how the world of the original photos was moved before the file was saved.
+``transforms.json`` is nerfstudio's and instant-ngp's format. Each of its ``frames`` has a
+``transform_matrix``, camera to world, OpenGL axes (x right, y up, z back). ``fl_x``, ``fl_y``,
+``cx``, ``cy``, ``w``, ``h`` and the distortion are given per frame or once for all frames;
+``camera_angle_x``, the horizontal field of view in radians, may replace focal lengths.
+``applied_transform`` (3 x 4) and ``applied_scale`` are the transform from the world of the original
+photos to that of the file.
 
 INRIA's training of 3D Gaussian Splatting writes ``cameras.json`` beside its scenes: a list of
 cameras with ``id``, ``img_name``, ``width``, ``height``, ``position`` (3), ``rotation`` (3 x 3,
-camera to world, OpenCV axes), ``fx`` and ``fy``. The principal point is the picture's centre. Poses
-are in the scene's frame.
+camera to world, OpenCV axes), ``fx`` and ``fy``. The principal point is the image centre. Poses are
+in the scene's frame.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
 def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
-    """The cameras in the JSON of a ``transforms.json``. Raises DataError if a frame has no usable
-    pose or intrinsics, or a camera has no focal length (a panorama)."""
+    """The cameras of a ``transforms.json``. Raises DataError if a frame has no usable pose or
+    intrinsics, or a camera has no focal length (a panorama)."""
     frames = content["frames"]
     need_count(path, len(frames))
     distortion = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -55,16 +56,16 @@ def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(
-                f"{path}: camera {index} is no frame; expected an object with 'transform_matrix'"
+                f"{path}: camera {index} is not a frame; expected an object with 'transform_matrix'"
             )
-        # A frame may have none of these, or hundreds of others.
+        # A frame may lack all of these, and have hundreds of other keys.
         said = {name: frame.get(name, content.get(name)) for name in names}
         found.append(_camera(frame, said, index, path))
     return CameraFile(found, _saved_motion(content, path))
 
 
 def _pose(rows: Any) -> list[float] | None:
-    """The 16 numbers of a pose of OpenGL's axes in OpenCV's; None if it is none."""
+    """A pose with OpenGL axes as 16 numbers with OpenCV axes; None if it is not a pose."""
     numbers = matrix(rows, (3, 4), 4)
     if numbers is None:
         return None
@@ -83,7 +84,7 @@ def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path)
         "OPENCV_FISHEYE",
         "FISHEYE",
     )
-    if kind is not None and kind not in lenses:  # one without a focal length
+    if kind is not None and kind not in lenses:  # a model without a focal length
         raise DataError(
             f"{path}: camera {index} is {str(kind)[:40]!r}; expected one of {', '.join(lenses)}"
         )
@@ -131,12 +132,12 @@ def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path)
 
 
 def _focal(side: float, angle: float | None) -> float | None:
-    """Focal length, pixels, of a field of view in radians."""
+    """Focal length, pixels, for a field of view in radians."""
     return 0.5 * side / math.tan(0.5 * angle) if angle is not None and 0 < angle < math.pi else None
 
 
 def _saved_motion(content: dict[str, Any], path: Path) -> Motion:
-    """Transform from the original world to that of the file."""
+    """Transform from the original world to the file's."""
     rows = content.get("applied_transform")
     if rows is None:
         rows = torch.eye(4, **FLOATS)[:3].tolist()
@@ -154,7 +155,7 @@ def _saved_motion(content: dict[str, Any], path: Path) -> Motion:
 
 
 def inria_cameras(content: list[Any], path: Path) -> CameraFile:
-    """The cameras in the JSON of a ``cameras.json``; a DataError if an entry is no camera."""
+    """The cameras of a ``cameras.json``. Raises DataError if an entry is not a camera."""
     need_count(path, len(content))
     return CameraFile([_inria_camera(entry, index, path) for index, entry in enumerate(content)])
 

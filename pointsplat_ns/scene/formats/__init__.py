@@ -1,10 +1,9 @@
-"""The formats of scene files: which there are, which one a path means, and a module for each beside
-the plain PLY.
+"""Scene file formats: the table of all formats, and a module for each except plain PLY.
 
-One table decides for every file: what a file begins with, or for a zip archive what is in it, tells
-the format, whatever its name. Only ``.splat``, which has no sign of its own, goes by the name.
-Readers check counts and sizes against the size of the file before memory is taken, and bound what
-is decompressed.
+One table identifies every file. The first bytes, or for a zip archive the names of its files,
+decide the format, whatever the file is called. Only ``.splat`` has no magic number and is
+identified by name. Readers check counts and sizes against the file size before they allocate
+memory, and limit decompression.
 """
 
 from __future__ import annotations
@@ -39,32 +38,31 @@ class Format:
 
     name: str
     suffix: str
-    """The end of its files' names, lower case, or a whole name; empty for a format that only its
-    content tells."""
+    """Suffix of its file names, lower case, or a whole name; empty for a format that is identified
+    only by content."""
     read: Callable[[Path], Gaussians] | None = None
     write: Callable[[Gaussians, Path, Progress], None] | None = None
     starts: tuple[bytes, ...] = ()
-    """What its files begin with, if that tells."""
+    """Magic numbers at the start of its files, if they identify it."""
     holds: str = ""
-    """Pattern of the name of a file, without folders, in its zip archives, if that tells."""
+    """Pattern of a file name, without folders, in its zip archives, if that identifies it."""
     instead: str = ""
-    """What to do with a file of a format that is not read."""
+    """Advice to the user, for a format that is not read."""
     bytes_of: Callable[[int, int, Traits], int] | None = None
-    """Exact size of a file, bytes, by the number of Gaussians, their SH degree, and the scene's
-    traits; None if it depends on more."""
+    """Exact file size, bytes, from the number of Gaussians, their SH degree and the scene's traits;
+    None if it depends on more."""
     encode: Callable[[Gaussians, Progress], bytes] | None = None
-    """The bytes of a file of a scene, where only they tell its size."""
+    """Encodes a scene, where only the encoded bytes give the file size."""
     rounded: Callable[[Gaussians, float], Gaussians] | None = None
-    """A scene whose numbers are rounded, so that a file of it is smaller, by a tolerance (see
-    :mod:`rounding`)."""
+    """Rounds a scene's numbers to make its file smaller, by a tolerance (see :mod:`rounding`)."""
     capacity: Holds = Holds()
-    """The range and the step of each attribute in its files."""
+    """Range and step of each attribute in its files."""
 
 
 def _writer(
     encode: Callable[[Gaussians, Progress], bytes],
 ) -> Callable[[Gaussians, Path, Progress], None]:
-    """A function that writes encoded bytes to a file, whole or not at all."""
+    """A function that encodes a scene and writes it to a file atomically."""
 
     def write(scene: Gaussians, path: Path, progress: Progress) -> None:
         data = encode(scene, progress)
@@ -81,8 +79,8 @@ _CONVERT = (
 _EXPORT = "export the scene as .ply, .sog or .spz from the program that made it"
 
 FORMATS = (
-    # Longer ends of names come before those that they end with; what several formats hold after
-    # what one holds.
+    # Longer suffixes come before the suffixes that they end with, and names that occur in several
+    # formats after names that occur in one.
     Format("compressed PLY", ".compressed.ply", read_compressed_ply, starts=_PLY),
     Format(
         "3DGS PLY",
@@ -162,7 +160,7 @@ FORMATS = (
         instead="download the file again",
     ),
 )
-"""All formats of files that hold nothing but a scene, and those that are refused by name."""
+"""All formats of files that hold only a scene, and the formats that are refused by name."""
 
 READABLE = ", ".join(
     kind.suffix for kind in FORMATS if kind.read and kind.suffix not in ("", ".ckpt")
@@ -171,16 +169,16 @@ WRITABLE = ", ".join(kind.suffix for kind in FORMATS if kind.write)
 
 
 def format_named(name: str) -> Format | None:
-    """The format that the end of a file's name means, such as ``.spz``; None if there is none."""
+    """The format of a file name or a suffix such as ``.spz``; None if no format has it."""
     name = Path(name).name.lower()
     ends = (kind for kind in FORMATS if kind.suffix and name.endswith(kind.suffix))
     return next((kind for kind in ends if kind.suffix.startswith(".") or name == kind.suffix), None)
 
 
 def format_to_read(path: Path) -> Format | None:
-    """The format of a file or SOG folder, streamed or not, by its content, else by its name; None
-    if neither is known. Raises SceneError if the file cannot be read, or its format is known and
-    not read."""
+    """The format of a file or SOG folder, streamed or not: by content, or else by name. None if
+    both are unknown. Raises SceneError if the file cannot be read, or its format is known but not
+    supported."""
     if path.is_dir():
         return next(
             (format_named(name) for name in (STREAM_META, SOG_META) if (path / name).is_file()),
@@ -196,7 +194,7 @@ def format_to_read(path: Path) -> Format | None:
 
 
 def _told_by_content(path: Path, start: bytes) -> Format | None:
-    """The format that a file's content tells, from its first bytes on; None if it tells none."""
+    """The format identified by a file's content, from its first bytes; None if none matches."""
     if start.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return _told_by_zip(path)
     kind = next((kind for kind in FORMATS if start.startswith(kind.starts)), None)
@@ -204,13 +202,14 @@ def _told_by_content(path: Path, start: bytes) -> Format | None:
         compressed, plain = FORMATS[:2]
         with suppress(SceneError), path.open("rb") as stream:
             return compressed if is_compressed(read_header(stream, path)) else plain
-        return plain  # with a damaged header, which its reader says
+        return plain  # its reader reports the damaged header
     return kind
 
 
 def _told_by_zip(path: Path) -> Format | None:
-    """The format that the names in a zip archive tell. Raises SceneError if they tell none; None if
-    the archive has no end, and the name of the file is one of a format that is an archive."""
+    """The format identified by the file names in a zip archive. None if the archive has no end and
+    the file has the suffix of a format that is an archive. Raises SceneError if no format
+    matches."""
     named = format_named(path.name)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -219,7 +218,7 @@ def _told_by_zip(path: Path) -> Format | None:
         if named is not None and named.holds:
             return None
         raise SceneError(
-            f"{path}: a zip archive that is truncated or damaged ({one_line(error)})"
+            f"{path}: a truncated or damaged zip archive ({one_line(error)})"
         ) from error
     files = [name.rpartition("/")[2].lower() for name in names]
     packed = next(
@@ -234,8 +233,7 @@ def _told_by_zip(path: Path) -> Format | None:
 
 
 def format_to_write(path: Path | str) -> Format:
-    """The format that a name asks for; a SceneError if no format that is written has such a
-    name."""
+    """The format of an output path; a SceneError if no writable format has its suffix."""
     path = Path(path)
     kind = format_named(path.name)
     if kind is None or kind.write is None:
@@ -245,13 +243,13 @@ def format_to_write(path: Path | str) -> Format:
 
 
 def format_like(path: Path) -> Format:
-    """The format to write what is made of a scene: that of the scene's file if it can be written,
-    SOG for a SOG folder and a compressed PLY, else PLY."""
+    """The output format for a scene derived from another file: that file's format if it can be
+    written, SOG for a SOG folder and a compressed PLY, else PLY."""
     if path.is_file() or path.is_dir():
-        with suppress(SceneError):  # one that cannot be read, which its reader says
+        with suppress(SceneError):  # its reader reports an unreadable file
             kind = format_to_read(path)
             if kind is not None and kind.read in (read_compressed_ply, read_sog):
-                return format_to_write(".sog")  # about as small
+                return format_to_write(".sog")  # similar file size
             if kind is not None and kind.write is not None:
                 return kind
     return format_to_write(".ply")

@@ -1,7 +1,8 @@
-"""What a format can hold of each attribute, and what a scene loses in it.
+"""The range of each attribute in a format, and the losses of a scene written in it.
 
-Each format declares its ranges (:class:`Holds`). Before a scene is written, :func:`losses` compares
-it with them. Small losses that a format has by design, such as its steps of sizes, count as none.
+Each format declares its ranges (:class:`Holds`). :func:`losses` compares a scene with them before
+it is written. Small losses that the format has by design, such as its steps of sizes, are not
+counted.
 """
 
 from __future__ import annotations
@@ -20,57 +21,57 @@ from pointsplat_ns.scene.offsets import offset_text
 from pointsplat_ns.system.tensors import DOUBLES
 
 _DARKEST = (-0.44 - 0.5) / SH_C0
-"""Constant SH coefficient that black need not fall below."""
+"""Constant SH coefficient below which all colours are black."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """The numbers that a format holds of one attribute."""
+    """Range of one attribute in a format."""
 
     low: float = -math.inf
     high: float = math.inf
     step: float = 0.0
-    """Between neighbouring numbers; 0 for those of float32, or where they depend on the scene."""
+    """Distance of neighbouring values; 0 for float32, or if it depends on the scene."""
 
     def holds(self, values: Tensor) -> Tensor:
-        """Whether values are in the range, up to half a step."""
+        """Whether values are in the range, extended by half a step."""
         return (values >= self.low - 0.5 * self.step) & (values <= self.high + 0.5 * self.step)
 
 
 FLOAT = Span()
-"""Numbers of float32."""
+"""The range of float32."""
 
 
 @dataclass(frozen=True)
 class Holds:
-    """What a format can hold."""
+    """Ranges of all attributes in a format."""
 
     sizes: Span = FLOAT
     """Natural logarithms of standard deviations in scene units."""
     colours: Span = FLOAT
     """Constant SH coefficients."""
     sh: Span | None = FLOAT
-    """The other SH coefficients; None if there are none."""
+    """The other SH coefficients; None if the format has none."""
     position_steps: Callable[[Gaussians], Tensor] | None = None
-    """Steps (N,) of the positions of a scene; None where a float32 scene loses nothing."""
+    """Position steps (N,) of a scene; None if a float32 scene loses nothing."""
     antialiased: bool = True
-    """Whether files say that a scene was trained with antialiasing."""
+    """Whether files record that a scene was trained with antialiasing."""
     offset: bool = False
-    """Whether files say the offset of positions."""
+    """Whether files record the offset of positions."""
     fitted: Callable[[Gaussians], tuple[Gaussians, str]] | None = None
-    """The scene as it is written, brought into the range where little is lost by that, and what was
-    moved, in words."""
+    """Returns the scene as written, moved into the format's range with little loss, and a
+    description of the changes."""
 
 
 def losses(scene: Gaussians, holds: Holds) -> list[str]:
-    """What a scene, float32 on the CPU, loses in a format: a clause with numbers for each
-    attribute, none where the format holds it, or at most 1 % of the Gaussians lose something, by
-    their weight in pictures."""
+    """Losses of a scene, float32 on the CPU, in a format: one clause with numbers per attribute.
+    An attribute is omitted if the format can hold it, or if it changes in at most 1 % of the
+    Gaussians, by their weight in renders."""
     found = []
     if scene.antialiased and not holds.antialiased:
-        found.append("the mark of antialiased training")
+        found.append("the flag for antialiased training")
     if scene.offset is not None and not holds.offset:
-        found.append(f"the offset {offset_text(scene.offset)} of positions")
+        found.append(f"the position offset {offset_text(scene.offset)}")
     if not len(scene):
         return found
     fitted, moved = (scene, "") if holds.fitted is None else holds.fitted(scene)
@@ -91,34 +92,33 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
             )
     ordered = scene.scales.sort(dim=1).values
     sizes = holds.sizes
-    drawn = scene.replace(
-        scales=scene.scales.clamp_min(sizes.low)
-    )  # as large as the smallest become
+    # smaller ones are drawn at the smallest size
+    drawn = scene.replace(scales=scene.scales.clamp_min(sizes.low))
     found += _cut(ordered[:, 1] < sizes.low, drawn, "smaller", sizes.low, "larger")
     found += _cut(ordered[:, 2] > sizes.high, scene, "larger", sizes.high, "smaller")
     if holds.sh is None and scene.sh_degree:
         found.append(
-            f"SH of degree {scene.sh_degree} are left out, so colours no longer change with the "
-            "view"
+            f"SH of degree {scene.sh_degree} are dropped, so colours no longer depend on the view "
+            "direction"
         )
     error = _colour_errors(scene, fitted, holds)
     share = _share(error > 0.2, scene)
     if share > 0.01:
         found.append(
-            f"{_percent(share)} of the Gaussians have colours outside of its range, by "
-            f"{float(error.max()):.2g} of white at most"
+            f"{_percent(share)} of the Gaussians have colours out of range, by up to "
+            f"{float(error.max()):.2g} of white"
         )
     return found
 
 
 def typical_sizes(scene: Gaussians) -> Tensor:
-    """The middle standard deviation (N,) of each Gaussian, float64, scene units, above 0."""
+    """Middle standard deviation (N,) of each Gaussian, float64, scene units, above 0."""
     return scene.scales.double().median(dim=1).values.clamp(-200.0, 200.0).exp()
 
 
 def seen_colours(dc: Tensor, rest: Tensor) -> Tensor:
-    """The colours (..., D) of constant SH coefficients (...) and the others (..., K), as drawn in D
-    directions that cover the sphere: 0 where they would be negative."""
+    """Colours (..., D) in D directions that cover the sphere, from constant SH coefficients (...)
+    and the others (..., K); negative colours become 0, as in rendering."""
     basis = _basis(rest.shape[-1]).to(rest)
     return (0.5 + SH_C0 * dc[..., None] + rest @ basis).clamp_min(0.0)
 
@@ -135,19 +135,19 @@ def _basis(count: int) -> Tensor:
 
 
 def within_colours(scene: Gaussians, colours: Span, sh: Span) -> Gaussians:
-    """A scene whose SH are within ranges, and look most alike from all directions.
+    """A scene with SH coefficients in range that looks as similar as possible in all directions.
 
-    A colour is drawn as 0 where it would be negative. So a constant coefficient that is dark from
-    all directions may rise, and another one if the others shrink with it. Among such pairs, and the
-    numbers cut at the ranges, the one with the least squared error of :func:`seen_colours` is
-    taken, for each Gaussian and channel that is out of range.
+    Negative colours are drawn as 0. So a constant coefficient that is black in all directions may
+    rise, and others may rise if the higher coefficients shrink with them. For each Gaussian and
+    channel out of range, the candidate with the least squared error of :func:`seen_colours` is
+    chosen, among these pairs and the coefficients clipped to the ranges.
     """
     # (N, 3), (N, 3, K)
     dc = scene.features_dc
     rest = scene.features_rest.transpose(1, 2)
     dark = (dc < _DARKEST).nonzero(as_tuple=True)
     if len(dark[0]):
-        unseen = (-0.5 - _peaks(rest[dark])) / SH_C0  # black from everywhere, if dc is lower
+        unseen = (-0.5 - _peaks(rest[dark])) / SH_C0  # black in all directions if dc is lower
         dc = dc.index_put(dark, torch.maximum(dc[dark], unseen.clamp_max(_DARKEST)))
         scene = scene.replace(features_dc=dc)
     outside = ~(colours.holds(dc) & sh.holds(rest).all(dim=2))
@@ -163,7 +163,7 @@ def within_colours(scene: Gaussians, colours: Span, sh: Span) -> Gaussians:
 
 
 def _most_alike(dc: Tensor, rest: Tensor, colours: Span, sh: Span) -> tuple[Tensor, Tensor]:
-    """The coefficients of :func:`within_colours`, of R channels: (R,) and (R, K)."""
+    """The coefficients of :func:`within_colours` for R channels: (R,) and (R, K)."""
     wanted = seen_colours(dc, rest)
     least = wanted.new_full(dc.shape, math.inf)
     best_dc = dc.clamp(colours.low, colours.high)
@@ -195,14 +195,14 @@ def _most_alike(dc: Tensor, rest: Tensor, colours: Span, sh: Span) -> tuple[Tens
 
 
 def _peaks(rest: Tensor) -> Tensor:
-    """What SH coefficients (R, K) above degree 0 add to a colour at most, (R,): their norm times
-    that of the basis, whose squares add up to K / (4 pi) in every direction."""
+    """Upper bound (R,) of the colour that SH coefficients (R, K) above degree 0 add: their norm
+    times the norm of the basis, whose squares sum to K / (4 pi) in every direction."""
     return rest.norm(dim=1) * math.sqrt(rest.shape[1] / (4 * math.pi))
 
 
 def _colour_errors(scene: Gaussians, fitted: Gaussians, holds: Holds) -> Tensor:
-    """The largest error of the seen colour (N,) in any direction and channel, where ranges cut the
-    fitted scene. Bands that a format leaves out are not counted."""
+    """Largest colour error (N,) over directions and channels after clipping the fitted scene to the
+    ranges. Bands that the format drops are not counted."""
     kept = scene.features_rest.shape[1] if holds.sh is not None else 0
     span = holds.sh or FLOAT
     pairs = [
@@ -231,12 +231,12 @@ def _cut(mask: Tensor, scene: Gaussians, than: str, limit: float, drawn: str) ->
 
 
 def _share(mask: Tensor, scene: Gaussians) -> float:
-    """The share of Gaussians, by number or by weight, whichever is larger."""
+    """Share of Gaussians, by count or by weight, whichever is larger."""
     return max(float(mask.double().mean()), _weight(mask, scene))
 
 
 def _weight(mask: Tensor, scene: Gaussians) -> float:
-    """The share of Gaussians by their weight in pictures."""
+    """Share of Gaussians by their weight in renders."""
     if not bool(mask.any()):
         return 0.0
     each = weights(scene)

@@ -1,5 +1,4 @@
-"""What the formats share: how numbers become few bits and come back, and reading untrusted
-bytes."""
+"""Shared by the formats: quantisation of attributes, and reading of untrusted bytes."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ Array = NDArray[Any]
 
 @contextmanager
 def damage_named(path: Path, kind: str) -> Iterator[None]:
-    """Turn errors of decoders into a :class:`SceneError` that names the file and its kind, such as
+    """Turn decoder errors into a :class:`SceneError` that names the file and its kind, such as
     "SPZ"."""
     of_decoders = (
         ValueError,
@@ -51,8 +50,8 @@ def damage_named(path: Path, kind: str) -> Iterator[None]:
         zipfile.BadZipFile,
     )
     try:
-        # Bits that mean NaN or Inf are no reason for numpy to warn: such Gaussians are dropped, and
-        # counted.
+        # No numpy warnings for bits that mean NaN or Inf: these Gaussians are dropped and counted
+        # later.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             yield
     except SceneError:
@@ -72,12 +71,12 @@ def load_bytes(path: Path) -> bytes:
 
 
 def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: int) -> None:
-    """Raise a SceneError, before memory is taken, if the header of a compressed file declares more
-    bytes than ``packed`` can hold, or more Gaussians (with ``rest`` SH coefficients per channel
-    beyond the constant one) than fit into memory."""
-    # A compressed byte holds at most 100: 216,000 Gaussians that differ in nothing but their place
-    # on a grid have 27, trained scenes less than 4. A file of any size may hold 4 MB, 200,000 equal
-    # Gaussians.
+    """Check the header of a compressed file before memory is allocated. Raises SceneError if it
+    declares more bytes than ``packed`` bytes can hold, or more Gaussians (with ``rest`` SH
+    coefficients per channel beyond the constant one) than fit into memory."""
+    # A compressed byte holds at most 100 bytes: 216,000 Gaussians that differ only in their place
+    # on a grid reach 27, trained scenes less than 4. A file of any size may hold 4 MB: 200,000
+    # equal Gaussians.
     if unpacked > max(1 << 22, 100 * packed):
         raise SceneError(
             f"{path}: the header declares {count} Gaussians of {unpacked} bytes in all, more than "
@@ -87,7 +86,7 @@ def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: 
 
 
 class Blocks:
-    """Arrays that follow one another in the bytes of a file, from ``start`` on."""
+    """Consecutive arrays in the bytes of a file, from offset ``start``."""
 
     def __init__(self, data: bytes | memoryview, path: Path, start: int = 0):
         self._data = data
@@ -95,7 +94,7 @@ class Blocks:
         self._position = start
 
     def take(self, dtype: str | np.dtype, *shape: int) -> NDArray:
-        """The next array, not copied; a SceneError if the bytes end before it does."""
+        """The next array, without a copy; a SceneError if the data ends too early."""
         count = math.prod(int(side) for side in shape)
         left = len(self._data) - self._position
         size = count * np.dtype(dtype).itemsize
@@ -117,7 +116,7 @@ def scene_of(
     dc: ArrayLike,
     rest: ArrayLike,
 ) -> Gaussians:
-    """The scene, float32, of decoded arrays: means (N, 3), log-scales (N, 3), quaternions (N, 4)
+    """A float32 scene from decoded arrays: means (N, 3), log-scales (N, 3), quaternions (N, 4)
     wxyz, opacity logits (N,), and SH coefficients (N, 3) and (N, K, 3)."""
     columns = (means, scales, quats, np.reshape(opacities, (-1, 1)), dc, rest)
     return Gaussians(
@@ -126,8 +125,8 @@ def scene_of(
 
 
 def joined(parts: Sequence[Gaussians], degree: int | None = None) -> Gaussians:
-    """All Gaussians of several scenes, in order, with SH up to a degree, by default the largest of
-    theirs. Bands that a scene does not have are zero."""
+    """All Gaussians of several scenes, in order, with SH up to ``degree``, by default the highest
+    of the scenes. Missing bands are zero."""
     if degree is None:
         degree = max((part.sh_degree for part in parts), default=0)
     filled = [Gaussians.empty(degree)]
@@ -140,8 +139,8 @@ def joined(parts: Sequence[Gaussians], degree: int | None = None) -> Gaussians:
 
 
 def logits_of_bytes(levels: Array) -> Array:
-    """Opacity logits of bytes, finite, as some programs drop infinite ones: bytes 0 and 255 count
-    as 0.25 and 254.75, in the middle of what is written as these."""
+    """Finite opacity logits of bytes. Bytes 0 and 255 are decoded as 0.25 and 254.75, the middle of
+    the values rounded to them, because some programs drop infinite logits."""
     share = np.clip(levels.astype(np.float64), 0.25, 254.75) / 255
     return np.log(share / (1 - share)).astype(np.float32)
 
@@ -152,24 +151,24 @@ def bytes_of_logits(scene: Gaussians) -> Array:
 
 
 def shares_of_dc(scene: Gaussians) -> Array:
-    """Colours (N, 3) of the constant SH coefficients, float64; they may lie outside [0, 1]."""
+    """Colours (N, 3) of the constant SH coefficients, float64; may be outside of [0, 1]."""
     return 0.5 + SH_C0 * scene.features_dc.double().numpy()
 
 
 def to_bytes(values: Array | Tensor) -> Array:
-    """Numbers rounded to the nearest byte."""
+    """Values rounded to the nearest byte."""
     return np.clip(np.rint(np.asarray(values)), 0, 255).astype(np.uint8)
 
 
 def unit_quats(scene: Gaussians) -> Array:
-    """Quaternions (N, 4) wxyz of length 1, float64; zero is the identity."""
+    """Unit quaternions (N, 4) wxyz, float64; zero becomes the identity."""
     quats = zero_as_identity(scene.quats).double()
     return (quats / quats.norm(dim=1, keepdim=True)).numpy()
 
 
 def smallest_three(unit: Array) -> tuple[Array, Array]:
-    """Quaternions (N, 4) of length 1 without their largest component, which is made positive: its
-    index (N,), and the others in order, (N, 3), within +-1/sqrt(2)."""
+    """Smallest-three encoding of unit quaternions (N, 4): the index (N,) of the largest component,
+    whose sign is made positive, and the others in order, (N, 3), within +-1/sqrt(2)."""
     largest = np.abs(unit).argmax(axis=1)
     rows = np.arange(len(unit))
     signed = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
@@ -177,8 +176,8 @@ def smallest_three(unit: Array) -> tuple[Array, Array]:
 
 
 def from_smallest_three(largest: Array, others: Array) -> Array:
-    """Quaternions (N, 4) of what :func:`smallest_three` returns; components that are too long leave
-    the largest 0."""
+    """Quaternions (N, 4) from the result of :func:`smallest_three`. If the other components are too
+    long, the largest is 0."""
     quats = np.empty((len(others), 4), np.float32)
     np.put_along_axis(quats, _OTHERS[largest], others.astype(np.float32), axis=1)
     left = np.clip(1.0 - np.square(others.astype(np.float64)).sum(axis=1), 0.0, None)
@@ -187,7 +186,7 @@ def from_smallest_three(largest: Array, others: Array) -> Array:
 
 
 def morton_order(scene: Gaussians) -> Tensor:
-    """Indices (N,) that bring neighbours in space together."""
+    """Indices (N,) along a Morton curve, which puts neighbours in space together."""
     if len(scene) == 0:
         return torch.zeros(0, **INDICES)
     low, high = scene.means.double().aminmax(dim=0)

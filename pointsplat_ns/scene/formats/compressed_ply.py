@@ -1,8 +1,8 @@
-"""PlayCanvas' compressed PLY, read only: 16 bytes a Gaussian, and one for each SH coefficient.
+"""Reads PlayCanvas' compressed PLY: 16 bytes a Gaussian, and one per SH coefficient.
 
-Gaussians are grouped in chunks of 256. For each chunk the file has the bounds of positions,
-log-scales and colours; a Gaussian is four 32-bit words of bits between these bounds, and a
-quaternion without its largest component.
+Gaussians are grouped in chunks of 256. Each chunk has bounds of positions, log-scales and colours.
+A Gaussian is four 32-bit words: values between these bounds, and a quaternion without its largest
+component.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _BOUNDS = tuple(
 
 
 def is_compressed(header: Header) -> bool:
-    """Whether a PLY's header is that of a compressed one."""
+    """Whether a PLY header belongs to a compressed PLY."""
     return any(name in _PACKED for element in header.elements for name, _ in element.properties)
 
 
 def read_compressed_ply(path: Path | str) -> Gaussians:
-    """Read a compressed PLY, of any SH degree up to 3, as :func:`~pointsplat_ns.scene.read_scene`
-    does. Raises SceneError if the file is no compressed PLY, is truncated, or does not fit into
+    """Read a compressed PLY of SH degree 0 to 3, as :func:`~pointsplat_ns.scene.read_scene` does.
+    Raises SceneError if the file is not a compressed PLY, is truncated, or does not fit into
     memory."""
     path = require_file(path, "a compressed PLY file")
     with coding.damage_named(path, "compressed PLY"):
@@ -53,8 +53,8 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
 
 
 def _checked(header: Header, path: Path) -> tuple[int, int]:
-    """The number of Gaussians, and of SH coefficients per channel beyond the constant one; what the
-    header declares is checked against itself and the file's size."""
+    """The number of Gaussians, and of SH coefficients per channel beyond the constant one. Checks
+    the header for consistency and against the file size."""
     elements = {element.name: element for element in header.elements}
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
@@ -64,8 +64,7 @@ def _checked(header: Header, path: Path) -> tuple[int, int]:
         )
     if header.order != "<":
         raise SceneError(
-            f"{path}: a compressed PLY in another byte order or ASCII; expected "
-            "binary_little_endian"
+            f"{path}: a big-endian or ASCII compressed PLY; expected binary_little_endian"
         )
     listed = [name for element in header.elements for name in element.lists]
     if listed:
@@ -123,7 +122,7 @@ def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussia
             level = sh[f"f_rest_{i}"].astype(np.float32)
             share = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / 256))
             coefficients[:, i % rest, i // rest] = (share - 0.5) * 8
-    # Shift and number of bits of each of three numbers in a word.
+    # Shift and width, bits, of three numbers in a word.
     eleven = ((21, 11), (11, 10), (0, 11))
     ten = ((20, 10), (10, 10), (0, 10))
     eight = ((24, 8), (16, 8), (8, 8))
@@ -140,7 +139,7 @@ def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussia
 
 
 def _unpack(words: Array, bits: tuple[tuple[int, int], ...]) -> Array:
-    """Shares in [0, 1], (N, 3), in some bits of words (N,)."""
+    """Shares in [0, 1], (N, 3), from bit fields of words (N,)."""
     return np.stack(
         [(words >> shift & (1 << n) - 1).astype(np.float32) / ((1 << n) - 1) for shift, n in bits],
         axis=1,

@@ -1,5 +1,4 @@
-"""Writes the content of 3D Tiles: glTF with the Gaussians as SPZ inside
-(``KHR_gaussian_splatting``), as ``.glb``."""
+"""Writes 3D Tiles content: ``.glb`` with Gaussians as SPZ inside (``KHR_gaussian_splatting``)."""
 
 from __future__ import annotations
 
@@ -11,15 +10,14 @@ from pointsplat_ns.scene.formats.spz import encode_spz
 from pointsplat_ns.scene.gaussians import Gaussians
 
 TILE_EXTENSIONS = ("KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2")
-"""What a program must know to draw tiles."""
+"""glTF extensions that a viewer must support to draw tiles."""
 
 
 def encode_tile(scene: Gaussians) -> bytes:
-    """The bytes of a ``.glb`` with the N > 0 Gaussians of a scene, float32 on the CPU, as CesiumJS
-    wants them.
+    """Encode the N > 0 Gaussians of a scene, float32 on the CPU, as a ``.glb`` for CesiumJS.
 
-    The scene has z up, as tiles have. Its node turns it to y up, as glTF has, and moves it to its
-    offset. The axes in the SPZ are the scene's.
+    The scene is z-up, as 3D Tiles are. Its node rotates it to glTF's y-up and moves it to its
+    offset. The SPZ keeps the scene's axes.
     """
     packed = encode_spz(scene.replace(offset=None))
     (prefix, packing) = TILE_EXTENSIONS
@@ -43,15 +41,14 @@ def encode_tile(scene: Gaussians) -> bytes:
         "mode": 0,
         "extensions": {prefix: {"extensions": {packing: {"bufferView": 0}}}},
     }
+    # columns
     content = {
         "asset": {"version": "2.0", "generator": "pointsplat-ns"},
         "extensionsUsed": TILE_EXTENSIONS,
         "extensionsRequired": TILE_EXTENSIONS,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [
-            {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, x, z, -y, 1]}
-        ],  # columns
+        "nodes": [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, x, z, -y, 1]}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": len(packed)}],

@@ -1,4 +1,4 @@
-"""Codebooks for SOG: few numbers, or few rows of SH coefficients, that stand for many."""
+"""Codebooks for SOG: a few numbers, or rows of SH coefficients, that represent many."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ LEVELS = 256
 
 
 def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
-    """256 numbers that stand for finite float32 values of any shape, by Lloyd's algorithm (k-means
-    in one dimension): the codebook (256,), ascending, and the index of the nearest entry for each
-    value, uint8 of the same shape."""
+    """A codebook of 256 numbers for finite float32 values of any shape, by Lloyd's algorithm
+    (1D k-means). Returns the codebook (256,), ascending, and the index of the nearest entry for
+    each value, uint8, of the same shape."""
     flat = values.flatten()
     if not flat.numel():
         return torch.zeros(LEVELS, **FLOATS), torch.zeros(
@@ -36,7 +36,7 @@ def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _distinct(values: Tensor) -> Tensor | None:
-    """The values themselves, if no more than 256 of them differ; the last is repeated."""
+    """The distinct values, if there are at most 256, padded with the last one."""
     distinct = values[: 2 * LEVELS].unique()
     distinct = distinct if len(distinct) > LEVELS else values.unique()
     return (
@@ -47,8 +47,8 @@ def _distinct(values: Tensor) -> Tensor | None:
 
 
 def _spread(values: Tensor) -> Tensor:
-    """256 numbers as dense as the cube root of the density of the values, which is best for the
-    mean squared error where numbers are many (Panter and Dite 1951)."""
+    """256 numbers whose density is the cube root of the values' density, which minimises the mean
+    squared error of many numbers (Panter and Dite 1951)."""
     low = float(values.amin())
     high = float(values.amax())
     bins = min(max(values.numel() // 16, 64), 4096)
@@ -61,29 +61,30 @@ def _spread(values: Tensor) -> Tensor:
 
 
 def _nearest(book: Tensor, values: Tensor) -> Tensor:
-    """Index in an ascending codebook of the entry nearest to each value."""
+    """Index of the nearest entry in an ascending codebook for each value."""
     return torch.bucketize(values, (book[1:] + book[:-1]) / 2)
 
 
 def palette(
     rows: Tensor, size: int, weights: Tensor, progress: Callable[[float], None]
 ) -> tuple[Tensor, Tensor]:
-    """Rows that stand for finite float32 rows (N, D), by k-means in levels: rows are split into
-    clusters, each gets a part of the palette, as large as its squared error, and is split in turn.
-    That takes a small part of the time of k-means with as many clusters at once. If there are no
-    more different rows than entries, they are the palette.
+    """A palette of rows for finite float32 rows (N, D), by hierarchical k-means.
+
+    Rows are split into clusters. Each cluster gets a part of the palette in proportion to its
+    squared error, and is split again. This takes a small part of the time of flat k-means with as
+    many clusters. If there are no more distinct rows than entries, they are the palette.
 
     Args:
         rows: finite float32 rows (N, D).
-        size: entries, a multiple of 64.
-        weights: how much the squared error of each row counts (N,), above 0.
+        size: number of entries, a multiple of 64.
+        weights: weight (N,) of each row's squared error, above 0.
         progress: called with the share done.
 
     Returns:
-        The palette (P, D), P a multiple of 64, and the index (N,) of the entry for each row.
+        The palette (P, D), P a multiple of 64, and the index (N,) of each row's entry.
     """
     n = len(rows)
-    # clusters that rows are split into, and how often
+    # clusters per level, and number of levels
     branches = 64
     deepest = 6
     if (found := _different(rows, size)) is not None:
@@ -98,9 +99,8 @@ def palette(
         members, k, depth = waiting.pop()
         part = rows[members]
         weight = weights[members]
-        at_once = (
-            k <= branches or k * len(part) <= 1 << 22
-        )  # for fewer, splits take longer and err more
+        # fewer make splits slower and less accurate
+        at_once = k <= branches or k * len(part) <= 1 << 22
         if not at_once and depth < deepest:
             sample = torch.randperm(len(part), generator=generator, device="cpu")[: 1 << 17]
             centres = _means(part[sample], weight[sample], branches, generator)
@@ -115,8 +115,8 @@ def palette(
                 (group, own, depth + 1) for group, own in zip(groups, share, strict=True) if own
             ]
             continue
-        # Rows that clusters do not tell apart, as where nearly all are equal, are cut into pieces
-        # of one size.
+            # Rows that k-means cannot separate, for example if nearly all are equal, are cut into
+            # pieces of equal size.
         if at_once:
             centres = _means(part, weight, k, generator)
             of = _assign(part, centres)
@@ -133,8 +133,8 @@ def palette(
 
 
 def _piece_of(rows: Tensor, k: int) -> Tensor:
-    """Which of ``k`` pieces of about one size each row (N, D) is in, along the column that varies
-    most."""
+    """Piece of each row (N, D): ``k`` pieces of similar size along the column of largest
+    variance."""
     order = rows[:, int(rows.var(dim=0).argmax())].argsort(stable=True)
     pieces = torch.empty(len(rows), **INDICES)
     pieces[order] = torch.arange(len(rows), **INDICES) * k // len(rows)
@@ -142,8 +142,8 @@ def _piece_of(rows: Tensor, k: int) -> Tensor:
 
 
 def _different(rows: Tensor, most: int) -> tuple[Tensor, Tensor] | None:
-    """The rows themselves and the index of each, if at most ``most`` differ; zeros fill the rest up
-    to a multiple of 64."""
+    """The distinct rows and the index of each row's, if there are at most ``most``; padded with
+    zeros to a multiple of 64."""
     sums = rows.double() @ torch.linspace(1.0, 2.0, rows.shape[1], **DOUBLES).sqrt()
     if len(sums[: 2 * most].unique()) > most:
         return None
@@ -158,8 +158,8 @@ def _different(rows: Tensor, most: int) -> tuple[Tensor, Tensor] | None:
 
 
 def _apportion(counts: Tensor, errors: Tensor, size: int) -> Tensor:
-    """``size`` entries shared out in proportion to errors, float64: at least one where there are
-    members, never more."""
+    """Distribute ``size`` entries in proportion to errors, float64: at least one per non-empty
+    cluster, and no more than it has members."""
     errors = torch.where(errors.sum() > 0, errors, counts.double())
     share = torch.minimum((errors * size / errors.sum()).floor().long().clamp_min(1), counts)
     order = errors.argsort(descending=True, stable=True)
@@ -186,7 +186,7 @@ def _means(rows: Tensor, weights: Tensor, k: int, generator: torch.Generator) ->
 
 
 def _assign(rows: Tensor, centres: Tensor) -> Tensor:
-    """Index (N,) of the centre nearest to each row."""
+    """Index (N,) of the nearest centre for each row."""
     half = 0.5 * centres.square().sum(dim=1)
-    step = max((1 << 22) // len(centres), 1)  # distances at once, 16 MB
+    step = max((1 << 22) // len(centres), 1)  # 16 MB of distances at a time
     return torch.cat([(half - part @ centres.T).argmin(dim=1) for part in rows.split(step)])

@@ -1,9 +1,8 @@
-"""Writes RAD, the format of Spark: a tree of Gaussians in pages of 65,536, of which a viewer loads
-those that it needs.
+"""Writes RAD, the format of Spark: a tree of Gaussians in pages of 65,536, loaded on demand.
 
-A file is a description in JSON and the pages. A page is a description and an array for each
-attribute, one component after the other, deflated. The root is the first Gaussian, and children of
-a Gaussian follow one another.
+A file is a description in JSON, followed by the pages. A page is a description and one array per
+attribute, component by component, deflated. The root is the first Gaussian; the children of a
+Gaussian are consecutive.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ _PAGE = 65536
 def encode_rad(
     scene: Gaussians, children: Tensor, starts: Tensor, progress: Progress = silent
 ) -> bytes:
-    """The bytes of a RAD file.
+    """Encode a tree of Gaussians as a RAD file.
 
     Args:
         scene: the N Gaussians of all levels, float32 on the CPU.
-        children: (N,) number of each Gaussian's children, at most :data:`MOST_CHILDREN`.
+        children: (N,) number of children of each Gaussian, at most :data:`MOST_CHILDREN`.
         starts: (N,) index of the first child.
-        progress: called while compressing.
+        progress: called during compression.
     """
     n = len(scene)
     degree = scene.sh_degree
@@ -99,9 +98,9 @@ def _padded(data: bytes) -> bytes:
 
 
 def _ranges(scene: Gaussians) -> dict[str, Any]:
-    """The ranges of bytes: of colours, of SH by degree, and those in which viewers keep sizes."""
+    """Ranges of bytes: of colours, of SH by degree, and of the sizes that viewers support."""
     colours = np.quantile(shares_of_dc(scene), [0.001, 0.999])
-    finite = scene.scales[scene.scales.isfinite()].double().numpy()  # without flat axes
+    finite = scene.scales[scene.scales.isfinite()].double().numpy()  # excludes flat axes
     sizes = np.quantile(finite, [0.001, 1.0]) if len(finite) else np.zeros(2)
     limits = {f"sh{degree}Max": 1.0 for degree in (1, 2, 3)}
     for degree in range(1, scene.sh_degree + 1):
@@ -117,15 +116,14 @@ def _ranges(scene: Gaussians) -> dict[str, Any]:
 
 
 def _band(scene: Gaussians, degree: int) -> Tensor:
-    """The SH coefficients (N, 3 * (2 d + 1)) of a degree d, the three colours of each together."""
+    """SH coefficients (N, 3 * (2 d + 1)) of degree d, the three channels of each together."""
     return scene.features_rest[:, degree**2 - 1 : (degree + 1) ** 2 - 1].reshape(len(scene), -1)
 
 
 def _attributes(
     scene: Gaussians, encoding: dict[str, Any], children: Tensor, starts: Tensor
 ) -> Iterator[tuple[tuple[str, str, dict[str, float]], Array]]:
-    """Each attribute of a page: its name, encoding and range, and its array, one component after
-    the other."""
+    """Attributes of a page: name, encoding with range, and array, component by component."""
     low = encoding["rgbMin"]
     high = encoding["rgbMax"]
     bytes_of_means = (
@@ -146,8 +144,7 @@ def _attributes(
 
 
 def _turns(quats: Array) -> Array:
-    """Rotations (N, 4) wxyz as (N, 3) bytes: the axis on an octahedron unfolded to a square, and
-    the angle."""
+    """Rotations (N, 4) wxyz as (N, 3) bytes: the axis in octahedral encoding, and the angle."""
     positive = np.where(quats[:, :1] < 0, -quats, quats)
     axes = positive[:, 1:]
     length = np.linalg.norm(positive[:, 1:], axis=1)

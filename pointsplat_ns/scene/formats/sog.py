@@ -1,8 +1,7 @@
-"""SOG files: PlayCanvas' format of WebP images, as a zip archive (``.sog``) or a folder with
-``meta.json``.
+"""SOG files: PlayCanvas' WebP images, in a zip archive (``.sog``) or a folder with ``meta.json``.
 
-A Gaussian is a pixel of each image. Positions are 16-bit logarithms, log-scales and colours are
-entries of a codebook of 256 numbers, quaternions lack their largest component, and SH are rows of a
+A Gaussian is a pixel of each image. Positions are 16-bit logarithms. Log-scales and colours are
+entries of a codebook of 256 numbers. Quaternions lack their largest component. SH are rows of a
 palette of up to 65,536.
 """
 
@@ -40,15 +39,15 @@ from pointsplat_ns.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.system.progress import Progress, silent
 
 MAX_SIDE = 16_383
-"""Pixels of a side of a WebP image, at most."""
+"""Maximum width and height of a WebP image, pixels."""
 
-_LEVELS = 65_535  # of positions, steps
-_ACROSS = 64  # palette entries in one row of pixels
+_LEVELS = 65_535  # steps of positions
+_ACROSS = 64  # palette entries per row of pixels
 
 
 def read_sog(path: Path | str) -> Gaussians:
-    """Read a ``.sog`` file, or a folder of its parts or the ``meta.json`` in one, of version 2 or
-    of the first, which has no number, as :func:`~pointsplat_ns.scene.read_scene` does. Raises
+    """Read a ``.sog`` file, or a folder of its parts or its ``meta.json``, of version 2 or of
+    version 1, which has no number, as :func:`~pointsplat_ns.scene.read_scene` does. Raises
     SceneError if a part is missing or damaged, or declares more than it can hold."""
     path = Path(path)
     with coding.damage_named(path, "SOG"), closing(Images(path)) as images:
@@ -56,13 +55,13 @@ def read_sog(path: Path | str) -> Gaussians:
 
 
 def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a ``.sog`` file of a scene, float32 on the CPU. Gaussians are reordered, so that
+    """Encode a scene, float32 on the CPU, as a ``.sog`` file. Gaussians are reordered, so that
     neighbours in the images are neighbours in space. Raises SceneError if there are more Gaussians
     than the images can hold."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
         for name, data in sog_parts(scene, progress).items():
-            # The same scene gives the same bytes, whenever it is written.
+            # The same scene gives the same bytes at any time.
             archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)
     return stream.getvalue()
 
@@ -74,9 +73,8 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
     n = meta["count"] if version == 2 else meta["means"]["shape"][0]
     if not isinstance(n, int) or not 0 <= n <= MAX_SIDE**2:
         raise SceneError(f"{path}: declares {n!r} Gaussians; expected a number up to {MAX_SIDE**2}")
-    coding.require_plausible(
-        path, 16 * n, images.size, n, _rest_of(meta)
-    )  # four images that every scene has
+    # the four images of every scene
+    coding.require_plausible(path, 16 * n, images.size, n, _rest_of(meta))
     pixels = functools.partial(_pixels, images, n)
     low = pixels(meta["means"], 0)
     high = pixels(meta["means"], 1)
@@ -84,13 +82,12 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
     logs = mins + (maxs - mins) * (low[:, :3].astype(np.float64) + 256.0 * high[:, :3]) / _LEVELS
     quats = pixels(meta["quats"])
     colors = pixels(meta["sh0"])
-    tops = (
-        quats[:, 3].astype(np.int64) - 252
-    )  # alpha is this plus the index of the largest component
+    # alpha is this value plus the index of the largest component
+    tops = quats[:, 3].astype(np.int64) - 252
     rotations = coding.from_smallest_three(
         tops.clip(0), (quats[:, :3].astype(np.float64) / 255 - 0.5) * 2**0.5
     )
-    rotations[tops < 0] = (1, 0, 0, 0)  # as the viewers of this format do
+    rotations[tops < 0] = (1, 0, 0, 0)  # as this format's viewers do
     dc = _looked_up(meta["sh0"], colors, 3 if version == 2 else 4)
     return coding.scene_of(
         _of_logs(logs),
@@ -107,7 +104,7 @@ def _pixels(images: Images, n: int, part: dict[str, Any], file: int = 0) -> Arra
 
 
 def _sh_of(meta: dict[str, Any]) -> dict[str, Any]:
-    """What ``meta.json`` says of SH beyond the constant one; empty if there are none."""
+    """The SH entry of ``meta.json``; empty if the SH degree is 0."""
     part = meta.get("shN") or {}
     if not isinstance(part, dict):
         raise ValueError(f"shN is a {type(part).__name__}, expected an object")
@@ -115,8 +112,8 @@ def _sh_of(meta: dict[str, Any]) -> dict[str, Any]:
 
 
 def _rest_of(meta: dict[str, Any]) -> int:
-    """SH coefficients per channel beyond the constant one; as many as there can be where only an
-    image tells."""
+    """SH coefficients per channel beyond the constant one; the maximum where only an image shows
+    the number."""
     part = _sh_of(meta)
     bands = part.get("bands", MAX_SH_DEGREE) if part else 0
     if not isinstance(bands, int) or not 0 <= bands <= MAX_SH_DEGREE:
@@ -138,7 +135,7 @@ def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
         colors = images.pixels(
             part["files"][0], _ACROSS * rest * -(-entries // _ACROSS), _ACROSS * rest
         )
-    else:  # version 1: the width of the image tells
+    else:  # version 1: the width of the image decides
         colors = images.pixels(
             part["files"][0], _ACROSS * 3 * -(-(int(index.max(initial=0)) + 1) // _ACROSS)
         )
@@ -152,8 +149,8 @@ def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
 
 
 def _looked_up(part: dict[str, Any], pixels: Array, channels: int) -> Array:
-    """Values (N, channels) float32 of bytes: entries of a codebook, or shares between bounds in
-    version 1."""
+    """Values (N, channels) float32 of bytes: codebook entries, or in version 1 shares between
+    bounds."""
     book = part.get("codebook")
     if book is None:
         low, high = (np.broadcast_to(_numbers(part[name]), channels) for name in ("mins", "maxs"))
@@ -170,7 +167,7 @@ def _looked_up(part: dict[str, Any], pixels: Array, channels: int) -> Array:
 
 
 def _numbers(values: Any, count: int | None = None) -> Array:
-    """Numbers of a JSON file."""
+    """Numbers in a JSON file."""
     array = np.asarray(values, np.float64)
     if count is not None and array.shape != (count,):
         raise ValueError(f"{array.size} numbers, expected {count}")
@@ -178,9 +175,9 @@ def _numbers(values: Any, count: int | None = None) -> Array:
 
 
 def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> dict[str, bytes]:
-    """The files of a SOG folder by name, of a scene, float32 on the CPU. ``ordered`` says that
-    neighbours in space follow one another already; otherwise Gaussians are reordered. Raises
-    SceneError as :func:`encode_sog`."""
+    """The files of a SOG folder by name, for a scene, float32 on the CPU. Gaussians are reordered
+    unless ``ordered``: neighbours in space are already consecutive. Raises SceneError as
+    :func:`encode_sog`."""
     n = len(scene)
     width = max(4 * math.ceil(math.sqrt(n) / 4), 4)
     height = max(4 * math.ceil(n / width / 4), 4)
@@ -196,7 +193,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
 
     levels, mins, maxs, _ = _levels_of(scene)
     steps = np.rint(levels).astype(np.int64)
-    scales, scale_index = codebook(scene.scales.clamp_min(HOLDS.sizes.low))  # as of flat axes
+    scales, scale_index = codebook(scene.scales.clamp_min(HOLDS.sizes.low))  # -Inf of flat axes
     colors, color_index = codebook(scene.features_dc)
     largest, others = coding.smallest_three(coding.unit_quats(scene))
     meta: dict[str, Any] = {
@@ -231,8 +228,8 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
 
 
 def _short(book: Tensor) -> list[float]:
-    """An ascending codebook, float32, in no more digits than tell its numbers apart. Copies of the
-    last are zeros, which no index reaches."""
+    """An ascending codebook, float32, with just enough digits to keep its numbers distinct. Copies
+    of the last are zeros, because no index uses them."""
     last = int((book < book[-1]).sum())
     return [float(f"{value:.9g}") for value in book[: last + 1].tolist()] + [0] * (
         len(book) - last - 1
@@ -240,13 +237,13 @@ def _short(book: Tensor) -> list[float]:
 
 
 def _of_logs(logs: Array) -> Array:
-    """Positions of their logarithms."""
+    """Positions from their logarithms."""
     return np.sign(logs) * np.expm1(np.abs(logs))
 
 
 def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array, Tensor]:
-    """Positions as logarithms, (N, 3) float64 from 0 to 65,535, the logarithms that are these two,
-    (3,) each, and the steps of positions there, (N, 3) float64, world units."""
+    """Positions as logarithms, (N, 3) float64 from 0 to 65,535; the logarithms at these two bounds,
+    (3,) each; and the local position steps, (N, 3) float64, world units."""
     means = scene.means.double().numpy()
     logs = np.sign(means) * np.log1p(np.abs(means))
     mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if len(means) else (np.zeros(3), np.zeros(3))
@@ -264,8 +261,8 @@ HOLDS = Holds(sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[
 
 def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
     """A scene that takes fewer bytes as SOG: its numbers are rounded
-    (:mod:`~pointsplat_ns.scene.formats.rounding`), and its SH above degree 0 are entries of a palette.
-    A tolerance of 0 leaves it."""
+    (:mod:`~pointsplat_ns.scene.formats.rounding`), and its SH above degree 0 become palette
+    entries. A tolerance of 0 changes nothing."""
     if not tolerance or not len(scene):
         return scene
     steps = steps_of(scene, tolerance)
@@ -273,7 +270,7 @@ def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
     coarse = multiples(
         torch.from_numpy(levels), (steps.means / of_level.clamp_min(1e-300)).clamp_min(1)
     ).numpy()
-    outermost = (levels <= 0) | (levels >= _LEVELS)  # they stay, so that levels keep their meaning
+    outermost = (levels <= 0) | (levels >= _LEVELS)  # fixed, because they define the levels
     logs = mins + (maxs - mins) * np.where(outermost, levels, coarse.clip(0, _LEVELS)) / _LEVELS
     means = torch.from_numpy(_of_logs(logs)).float()
     rest = _few_sh(scene, tolerance) if scene.sh_degree else scene.features_rest
@@ -281,15 +278,15 @@ def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
 
 
 def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
-    """SH above degree 0, (N, K, 3), as entries of the smallest palette whose colours have a small
-    enough error, at most one entry for two Gaussians. Its numbers are multiples of their error."""
+    """SH above degree 0, (N, K, 3), as entries of the smallest palette with a sufficiently small
+    colour error, at most one entry per two Gaussians. Its numbers are multiples of their error."""
     rows = scene.features_rest.flatten(1)
     each = weights(scene)
     wanted = ROUNDING.palette_error * tolerance / (SH_C0 * scene.features_rest.shape[1] ** 0.5)
     most = min(len(scene) // 2, 65_536)
 
     def made(share: float) -> tuple[Tensor, Tensor, float]:
-        """A palette of a number of entries, the index of each Gaussian's, and the error of a
+        """A palette of a given size, the entry index of each Gaussian, and the error of a
         coefficient."""
         book, index = palette(rows, 64 * max(int(share / 64), 1), each, lambda done: None)
         return (
@@ -305,7 +302,7 @@ def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
         size = 2 * size
         book, index, error = made(size)
         if error < wanted:
-            least = max(error, 1e-3 * wanted)  # where no error is left
+            least = max(error, 1e-3 * wanted)  # if the error is zero
             book, index, error = made(size * (wanted / least) ** (-1 / math.log2(before / least)))
     numbers, number = codebook((book / error).round() * error if error > 0 else book)
     return numbers[number.long()][index].reshape(scene.features_rest.shape)
@@ -317,12 +314,11 @@ def _pack_sh(
     size: tuple[int, int],
     progress: Progress,
 ) -> dict[str, Any]:
-    """Add the palette and its indices to ``images``; returns what ``meta.json`` says of them."""
+    """Add the palette and its indices to ``images``; returns their entry in ``meta.json``."""
     rest = scene.features_rest.shape[1]
-    report = functools.partial(progress, "making the SH palette")
-    entries = max(
-        1024, 1 << min(len(scene), 65_536).bit_length() >> 1
-    )  # a power of two; an index has 16 bits
+    report = functools.partial(progress, "building the SH palette")
+    # a power of two; an index has 16 bits
+    entries = max(1024, 1 << min(len(scene), 65_536).bit_length() >> 1)
     rows, index = palette(scene.features_rest.flatten(1), entries, weights(scene), report)
     levels, level_index = codebook(rows)
     labels = np.column_stack([index.numpy() & 255, index.numpy() >> 8, np.zeros(len(index))])

@@ -19,8 +19,8 @@ SOG_META = "meta.json"
 
 
 class Images:
-    """The parts of one SOG file: a zip archive, a folder, or the ``meta.json`` in one. Errors are
-    as :func:`~pointsplat_ns.scene.formats.coding.damage_named` has them, and SceneErrors."""
+    """The parts of one SOG file: a zip archive, a folder, or its ``meta.json``. Raises SceneError,
+    and errors for :func:`~pointsplat_ns.scene.formats.coding.damage_named` to convert."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -45,7 +45,7 @@ class Images:
 
     def meta(self) -> dict[str, Any]:
         """The content of ``meta.json``."""
-        content = json.loads(self._bytes(SOG_META, 1 << 22))  # one has about 20 kB
+        content = json.loads(self._bytes(SOG_META, 1 << 22))  # usually about 20 kB
         if not isinstance(content, dict):
             raise SceneError(
                 f"{self.path}: {SOG_META} holds a {type(content).__name__}; expected an object"
@@ -56,12 +56,12 @@ class Images:
         """The pixels of one image, (height, width, 4) uint8, RGBA.
 
         Args:
-            name: its file name, as ``meta.json`` gives it.
-            least: the number of pixels that are needed.
-            width: of the image, pixels, if it matters.
+            name: file name in ``meta.json``.
+            least: required number of pixels.
+            width: required width, pixels; None for any.
 
         Raises:
-            SceneError: if the image is missing, is no WebP, or has too few pixels or far too many.
+            SceneError: if the image is missing, is not WebP, or has too few or far too many pixels.
         """
         from PIL import Image
 
@@ -70,11 +70,10 @@ class Images:
                 f"{self.path}: an image called {name!r}; expected the name of a file beside "
                 f"{SOG_META}"
             )
-        most = 6 * least + (
-            1 << 16
-        )  # version 1 leaves open which of 3, 8 and 15 SH; some programs round sides up
+        # version 1 does not say whether SH are 3, 8 or 15; some programs round sides up
+        most = 6 * least + (1 << 16)
         data = self._bytes(name, 4 * most)
-        across, down = webp_size(data)  # opening an image takes the memory of its pixels already
+        across, down = webp_size(data)  # opening an image already allocates its pixels
         if across * down < least or across * down > most or width not in (None, across):
             needed = f"{least} pixels" + (f", {width} across" if width else "")
             raise SceneError(f"{self.path}: {name} has {across} x {down} pixels; expected {needed}")
@@ -86,7 +85,7 @@ class Images:
             raise SceneError(f"{self.path}: {name} is too large ({error})") from error
 
     def _bytes(self, name: str, most: int) -> bytes:
-        """The content of one part, which must not exceed ``most`` bytes."""
+        """Content of one part, limited to ``most`` bytes."""
         if self._zip is None:
             part = require_file(self._folder / name, "a part of a SOG folder")
             size = part.stat().st_size
@@ -104,12 +103,11 @@ class Images:
         if size > most:
             raise SceneError(f"{self.path}: {name} has {size} bytes; expected at most {most}")
         with part.open("rb") if self._zip is None else self._zip.open(entries[0]) as stream:
-            return stream.read(most + 1)  # the size in the archive may be a lie
+            return stream.read(most + 1)  # the declared size may be wrong
 
 
 def webp(pixels: Array, width: int, height: int) -> bytes:
-    """A lossless WebP image of pixels (up to width * height, 3 or 4), uint8; the rest is filled
-    with zeros."""
+    """A lossless WebP image of uint8 pixels (up to width * height, 3 or 4), padded with zeros."""
     from PIL import Image
 
     full = np.zeros((height * width, pixels.shape[1]), np.uint8)

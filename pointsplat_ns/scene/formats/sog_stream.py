@@ -1,9 +1,8 @@
-"""Streamed SOG: PlayCanvas' folder of SOG files for viewers that load the parts of a scene that
-they need.
+"""Streamed SOG: PlayCanvas' folder of SOG files, for viewers that load a scene in parts.
 
-``lod-meta.json`` holds a tree of boxes. A leaf names for each level of detail, the finest first,
+``lod-meta.json`` holds a tree of boxes. For each level of detail, finest first, a leaf names
 consecutive rows of one SOG folder, ``LEVEL_NUMBER/meta.json``. A viewer draws one level of every
-leaf. The scene that is read is one level.
+leaf. Reading gives the scene of one level.
 """
 
 from __future__ import annotations
@@ -37,18 +36,18 @@ from pointsplat_ns.system.files import (
 from pointsplat_ns.system.progress import Progress, silent
 
 STREAM_META = "lod-meta.json"
-"""The file that tells of all others."""
+"""Index file."""
 
 OWN_FILES = rf"{re.escape(STREAM_META)}|\d+_\d+"
-"""Pattern of the names that are written to the folder of a stream."""
+"""Pattern of the file names written into a stream's folder."""
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A part of a scene: a leaf, or two nodes."""
+    """A node of the tree: a leaf, or an inner node with two children."""
 
     rows: tuple[Tensor, ...] = ()
-    """Of a leaf: the indices of its Gaussians in each level."""
+    """For a leaf: indices of its Gaussians in each level."""
     children: tuple[Node, ...] = ()
 
 
@@ -56,12 +55,12 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
     """Read one level of a streamed SOG, and its surroundings (``environment``) if it has them.
 
     Args:
-        path: ``lod-meta.json``, or the folder of it.
+        path: ``lod-meta.json`` or its folder.
         level: 0 is the finest.
 
     Raises:
-        SceneError: if there is no such level, a file is missing, damaged or lies outside the
-            folder, or has another number of Gaussians than the tree says.
+        SceneError: if there is no such level, or a file is missing, is damaged, lies outside of the
+            folder, or has another number of Gaussians than the tree declares.
     """
     path = Path(path)
     path = path / STREAM_META if path.is_dir() else path
@@ -86,9 +85,11 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
 
 
 def coarser_levels(path: Path, finest: int) -> list[Gaussians]:
-    """All levels of a streamed SOG but the finest, which has ``finest`` Gaussians, the finer first;
-    no more of them than have twice as many Gaussians in all. None for a path that is no streamed
-    SOG. Raises SceneError as :func:`read_sog_stream`."""
+    """All levels of a streamed SOG below the finest, which has ``finest`` Gaussians, in order.
+
+    Stops once they have more than twice that number in total. Empty for any other path. Raises
+    SceneError as :func:`read_sog_stream`.
+    """
     path = path / STREAM_META if path.is_dir() else path
     if path.name != STREAM_META or not path.is_file():
         return []
@@ -124,18 +125,18 @@ def write_sog_stream(
     progress: Progress = silent,
     force: bool = True,
 ) -> dict[str, Any]:
-    """Write a streamed SOG: all of it, or nothing.
+    """Write a streamed SOG atomically.
 
-    All files are written beside before the first replaces an older one, see
+    All files are written to temporary names before the first one replaces an older file, see
     :func:`~pointsplat_ns.system.files.replacing_folder`.
 
     Args:
-        levels: the finest first; float32 on the CPU, of Gaussians that can be drawn.
-        tree: its leaves have rows of every level. Gaussians that are in no leaf are left out.
-        path: the ``lod-meta.json``, in a folder that is created if it is missing.
-        chunk: a SOG file is full when it has more Gaussians than this.
-        progress: called while encoding.
-        force: whether existing files may be replaced.
+        levels: finest first; float32 on the CPU, drawable Gaussians only.
+        tree: its leaves have rows of every level. Gaussians in no leaf are dropped.
+        path: the ``lod-meta.json``. Its folder is created if missing.
+        chunk: a SOG file is complete once it has more Gaussians than this.
+        progress: called during encoding.
+        force: whether to replace existing files.
 
     Returns:
         The content of ``lod-meta.json``.
@@ -143,8 +144,8 @@ def write_sog_stream(
     Raises:
         SceneError: if a file cannot be written.
     """
-    files: list[tuple[int, list[Tensor]]] = []  # the level of each, and its rows
-    last: dict[int, int] = {}  # of each level, its last file
+    files: list[tuple[int, list[Tensor]]] = []  # level and rows of each file
+    last: dict[int, int] = {}  # last file of each level
     names: list[str] = []
 
     def entry(level: int, members: Tensor) -> dict[str, int]:
@@ -209,8 +210,8 @@ def write_sog_stream(
 
 
 def _bound(parts: Sequence[Gaussians]) -> dict[str, list[float]]:
-    """The box of the boxes of all Gaussians, of one standard deviation along their axes, as other
-    programs write it, in the digits that float32 has."""
+    """Bounding box of all Gaussians, as boxes of one standard deviation along their axes, which is
+    how other programs compute it; printed with the digits of float32."""
     scene = joined(parts, 0)
     half = (rotation_matrices(scene.quats).abs() @ scene.stds[..., None])[..., 0]
     limit = torch.finfo(torch.float32).max
@@ -222,7 +223,7 @@ def _bound(parts: Sequence[Gaussians]) -> dict[str, list[float]]:
 
 
 def _meta(path: Path) -> dict[str, Any]:
-    """The content of ``lod-meta.json``, checked but for its tree."""
+    """The content of ``lod-meta.json``, checked except for its tree."""
     meta = json.loads(read_text(path))
     if not isinstance(meta, dict) or meta.get("version", 1) != 1:
         raise SceneError(f"{path}: not a {STREAM_META} of version 1")
@@ -235,12 +236,12 @@ def _meta(path: Path) -> dict[str, Any]:
         or not all(isinstance(name, str) for name in names)
         or len({*names}) != len(names)
     ):
-        raise ValueError("filenames are no list of names that differ")
+        raise ValueError("filenames are not a list of distinct names")
     return meta
 
 
 def _beside(path: Path, name: Any) -> Path:
-    """A file that ``lod-meta.json`` names. It must lie in its folder or below, and be SOG."""
+    """A SOG file named in ``lod-meta.json``, which must be in or below its folder."""
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or ".." in parts or PurePosixPath(name).is_absolute() or set("\\:") & set(name):
         raise SceneError(f"{path}: names the file {name!r}; expected one in its own folder")
@@ -250,13 +251,13 @@ def _beside(path: Path, name: Any) -> Path:
 
 
 def _counts(tree: Any, level: int, names: list[str]) -> Counter[int]:
-    """The number of Gaussians of a level that the tree names in each file, by the file's index."""
+    """Number of Gaussians of a level in each file according to the tree, by file index."""
     counts: Counter[int] = Counter()
     waiting = [tree]
     while waiting:
         node = waiting.pop()
         if not isinstance(node, dict) or not isinstance(node.get("children", []), list):
-            raise ValueError("a node of the tree is no object")
+            raise ValueError("a node of the tree is not an object")
         waiting += node.get("children", [])
         lods = node.get("lods", {})
         if not isinstance(lods, dict):

@@ -1,7 +1,7 @@
-"""``.splat`` files: 32 bytes a Gaussian and no header, as antimatter15's viewer introduced them.
+"""``.splat`` files: 32 bytes a Gaussian, no header, introduced by antimatter15's viewer.
 
-Position and standard deviations as float32, then colour and opacity, and the quaternion wxyz, as
-bytes. There are no SH beyond the constant coefficient.
+A row is position and standard deviations as float32, then colour, opacity and quaternion wxyz as
+bytes. The SH degree is 0.
 """
 
 from __future__ import annotations
@@ -46,11 +46,10 @@ def read_splat(path: Path | str) -> Gaussians:
     require_memory(path, size + size // _ROW.itemsize * 4 * 14)
     with coding.damage_named(path, ".splat"):
         rows = np.fromfile(path, _ROW)
+        # zero gives -Inf, a flat axis; a negative size gives NaN, which is dropped
         return coding.scene_of(
             rows["means"],
-            np.log(
-                rows["stds"]
-            ),  # of zero -Inf, a flat axis; of a negative size NaN, which is dropped
+            np.log(rows["stds"]),
             (rows["quats"].astype(np.float32) - 128) / 128,
             coding.logits_of_bytes(rows["rgba"][:, 3]),
             (rows["rgba"][:, :3].astype(np.float32) / 255 - 0.5) / SH_C0,
@@ -59,17 +58,15 @@ def read_splat(path: Path | str) -> Gaussians:
 
 
 def drawing_order(scene: Gaussians) -> Tensor:
-    """Indices (N,): the largest and most opaque Gaussians first, as viewers draw while they
-    load."""
+    """Indices (N,), largest and most opaque Gaussians first, because viewers draw while loading."""
     weight = scene.scales.double().clamp(-20, 20).sum(dim=1).exp() * scene.alphas
     return weight.argsort(descending=True, stable=True)
 
 
 def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a ``.splat`` file of a scene, float32 on the CPU, in :func:`drawing_order`.
+    """Encode a scene, float32 on the CPU, as a ``.splat`` file, in :func:`drawing_order`.
 
-    SH beyond the constant coefficient have no place in it and are left out. ``progress`` is not
-    called.
+    Drops SH above degree 0, for which the format has no place. ``progress`` is not called.
     """
     scene = scene[drawing_order(scene)]
     rows = np.empty(len(scene), _ROW)

@@ -1,9 +1,9 @@
-"""SPZ files: Niantic's format, 20 bytes a Gaussian and one for each SH coefficient, compressed.
+"""SPZ files: Niantic's compressed format, 20 bytes a Gaussian and one per SH coefficient.
 
 Versions 2 and 3 are one gzip stream, with quaternions of three and four bytes. Version 4 has one
-zstd stream for each attribute; it is read, and version 3 is written, which most viewers read.
-Positions are in fixed point of 24 bits. The format's documentation wants axes right, up, back; what
-is read and written here keeps the axes that it has, as most converters do.
+zstd stream per attribute. Versions 2 to 4 are read; version 3 is written, because most viewers read
+it. Positions are 24-bit fixed point. The format's documentation requires axes right, up, back; axes
+are not converted here, as in most converters.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from pointsplat_ns.system.progress import Progress, silent
 
 FRACTION_BITS = 12
 MAX_FRACTION_BITS = 23
-"""Bits of a position after the point: usually, in steps of 0.00024 within 2048 units, and at most.
-Scenes of smaller Gaussians get more, and scenes that reach farther get fewer."""
+"""Fractional bits of a position: the default, for steps of 0.00024 within 2048 units, and the
+maximum. Scenes of smaller Gaussians get more, and scenes that reach farther get fewer."""
 
 FARTHEST = 2**23 - 1
-"""Steps of positions from the origin, at most."""
+"""Largest distance of a position from the origin, in steps."""
 
 _COLOUR_SCALE = 0.15
 _MAGIC = b"NGSP"
-_HEADER = struct.Struct("<4sIIBBBB")  # magic, and the fields of _Head
+_HEADER = struct.Struct("<4sIIBBBB")  # magic, then the fields of _Head
 # flags
 _ANTIALIASED = 1
 _EXTENDED = 2
@@ -60,16 +60,18 @@ class _Head:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Bytes of positions, opacities, colours, scales, quaternions and SH."""
+        """Bytes of positions, opacities, colours, scales, quaternions and SH, in this order."""
         n = self.count
         return (9 * n, n, 3 * n, 3 * n, (3 if self.version == 2 else 4) * n, 3 * self.rest * n)
 
 
 def read_spz(path: Path | str) -> Gaussians:
-    """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.scene.read_scene` does. The axes
-    stay those of the file. Of SH degree 4, the highest band is left out, and extensions are not
-    read, which is logged. Raises SceneError if the file is of another kind or version, is
-    truncated, or declares more than it can hold."""
+    """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.scene.read_scene` does.
+
+    Axes are not converted. The highest band of SH degree 4, and extensions, are not read; both are
+    logged. Raises SceneError if the file has another format or version, is truncated, or declares
+    more than it can hold.
+    """
     path = require_file(path, "an SPZ file")
     with coding.damage_named(path, "SPZ"):
         data = coding.load_bytes(path)
@@ -91,15 +93,16 @@ def read_spz(path: Path | str) -> Gaussians:
 
 
 def encode_spz(scene: Gaussians, progress: Progress = silent, level: int = 9) -> bytes:
-    """The bytes of an SPZ file of version 3. The scene is brought into its range as by
-    :func:`fitted`. SH that were read from an SPZ file, or were rounded for one, stay as they are.
-    Of others, 6 bits are kept at degree 1 and 5 above, which compress better. The format's own
-    programs keep 5 and 4, in a file a seventh smaller.
+    """Encode a scene as an SPZ file of version 3, after :func:`fitted` moved it into range.
+
+    SH that were read from an SPZ file, or rounded for one, are unchanged. Others get 6 bits at
+    degree 1 and 5 bits above, which compress better. The format's own programs use 5 and 4 bits, in
+    a file a seventh smaller.
 
     Args:
         scene: N Gaussians, float32 on the CPU.
-        progress: called while compressing.
-        level: of gzip, 1 to 9. 6 takes a tenth of the time of 9, for 3 % more bytes.
+        progress: called during compression.
+        level: gzip level, 1 to 9. 6 takes a tenth of the time of 9, for 3 % more bytes.
 
     Raises:
         SceneError: if the scene is too large for the format.
@@ -121,8 +124,8 @@ def encode_spz(scene: Gaussians, progress: Progress = silent, level: int = 9) ->
 
 def rounded_for_spz(scene: Gaussians, tolerance: float) -> Gaussians:
     """A scene that takes fewer bytes as SPZ: its numbers are rounded as by
-    :func:`~pointsplat_ns.scene.formats.rounding.rounded`, those of SH to at most 8 bits. A tolerance
-    of 0 leaves it."""
+    :func:`~pointsplat_ns.scene.formats.rounding.rounded`, SH to at most 8 bits. A tolerance of 0
+    changes nothing."""
     if not tolerance or not len(scene):
         return scene
     small = rounded(fitted(scene)[0], tolerance)
@@ -130,11 +133,12 @@ def rounded_for_spz(scene: Gaussians, tolerance: float) -> Gaussians:
 
 
 def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
-    """A scene, float32 on the CPU, in the range of SPZ, and which Gaussians were moved, in words.
+    """A scene, float32 on the CPU, moved into the range of SPZ, and a description of the moved
+    Gaussians.
 
-    If few Gaussians, at most 1 %, are so far away that positions of all others would become coarse,
-    they move towards the median position and shrink in proportion: from there they look the same.
-    Colours are as of :func:`within_colours`.
+    If at most 1 % of the Gaussians are so far away that the positions of all others would become
+    coarse, they move towards the median position and shrink in proportion: seen from there, they
+    look the same. Colours are those of :func:`within_colours`.
     """
     assert HOLDS.sh is not None
     scene = within_colours(scene, HOLDS.colours, HOLDS.sh)
@@ -158,20 +162,19 @@ def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
     means[far] = (centre + share[:, None] * ways).float()
     scales[far] += share.log()[:, None].float()
     moved = (
-        f"Gaussians farther than {reach:.4g} units, {count} of them, are moved to there, smaller "
+        f"Gaussians farther than {reach:.4g} units ({count}) are moved to that distance and shrunk "
         "in proportion"
     )
     return scene.replace(means=means, scales=scales), moved
 
 
 def fraction_bits(scene: Gaussians) -> int:
-    """Bits after the point of the positions of a scene that is :func:`fitted`. Raises SceneError if
-    a Gaussian is out of reach."""
+    """Fractional bits of the positions of a scene that is :func:`fitted`. Raises SceneError if a
+    Gaussian is out of range."""
     fitting = _fitting_bits(scene)
     bits = max(_needed_bits(scene), FRACTION_BITS)
-    if not _is_exact(scene, bits) and _is_exact(
-        scene, bits + 1
-    ):  # of an SPZ file, whose sizes are rounded
+    # read from an SPZ file, whose sizes are rounded
+    if not _is_exact(scene, bits) and _is_exact(scene, bits + 1):
         bits += 1
     bits = min(fitting, bits)
     if bits < 0:
@@ -189,8 +192,7 @@ def _is_exact(scene: Gaussians, bits: int) -> bool:
 
 
 def _fitting_bits(scene: Gaussians) -> int:
-    """Bits after the point with which all positions fit into 24 bits, at most as many as there
-    are."""
+    """Largest number of fractional bits with which all positions fit into 24 bits."""
     farthest = float(scene.means.abs().max()) if len(scene) else 0.0
     return min(
         math.floor(math.log2(FARTHEST / farthest)) if farthest > 0 else MAX_FRACTION_BITS,
@@ -199,8 +201,7 @@ def _fitting_bits(scene: Gaussians) -> int:
 
 
 def _needed_bits(scene: Gaussians) -> int:
-    """Bits after the point with which the median size of a Gaussian has at least 8 steps of
-    positions."""
+    """Fractional bits for which the median size of a Gaussian is at least 8 position steps."""
     if not len(scene):
         return FRACTION_BITS
     size = float(typical_sizes(scene).median())
@@ -221,8 +222,8 @@ HOLDS = Holds(
 
 
 def _head(data: bytes, versions: tuple[int, ...], packed: int, path: Path) -> _Head:
-    """The header at the start of uncompressed data, checked; a file of ``packed`` bytes can hold
-    what it declares."""
+    """The checked header at the start of uncompressed data. Checks that a file of ``packed`` bytes
+    can hold what it declares."""
     if len(data) < _HEADER.size:
         raise SceneError(
             f"{path}: truncated; an SPZ header has {_HEADER.size} bytes, found {len(data)}"
@@ -238,16 +239,15 @@ def _head(data: bytes, versions: tuple[int, ...], packed: int, path: Path) -> _H
         raise SceneError(f"{path}: SH degree {head.degree}; expected 0 to 4")
     if head.fraction_bits > MAX_FRACTION_BITS:
         raise SceneError(
-            f"{path}: {head.fraction_bits} bits after the point; expected at most "
-            f"{MAX_FRACTION_BITS} of 24"
+            f"{path}: {head.fraction_bits} fractional bits; expected at most {MAX_FRACTION_BITS} "
+            "of 24"
         )
     coding.require_plausible(path, sum(head.sizes), packed, head.count, head.rest)
     return head
 
 
 def _parts_of_gzip(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryview]]:
-    """Header and attributes of versions 2 and 3. No more is decompressed than the header
-    declares."""
+    """Header and attributes of versions 2 and 3. Decompresses no more than the header declares."""
     head = _head(zlib.decompressobj(31).decompress(data, _HEADER.size), (2, 3), len(data), path)
     content = zlib.decompressobj(31).decompress(data, _HEADER.size + sum(head.sizes))
     blocks = Blocks(content, path, _HEADER.size)
@@ -255,14 +255,13 @@ def _parts_of_gzip(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
 
 
 def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryview]]:
-    """Header and attributes of version 4. No more is decompressed than the header declares."""
+    """Header and attributes of version 4. Decompresses no more than the header declares."""
     from zstandard import ZstdDecompressor, ZstdError
 
     head = _head(data, (4,), len(data), path)
     sizes = [size for size in head.sizes if size]
-    table = int(
-        Blocks(data, path, _HEADER.size).take("<u4", 1)[0]
-    )  # where it begins; extensions are before it
+    # start of the table; extensions come before it
+    table = int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])
     if head.streams != len(sizes) or table < 32:
         raise SceneError(
             f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from "
@@ -305,8 +304,8 @@ def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:
 
 
 def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes]:
-    """The attributes in the file's order."""
-    bands = scene.features_rest[:, :3], scene.features_rest[:, 3:]  # degree 1, and those above
+    """The attributes in file order."""
+    bands = scene.features_rest[:, :3], scene.features_rest[:, 3:]  # degree 1, and above
     first, other = (_coarse(rest.numpy(), kept) for rest, kept in zip(bands, sh_bits, strict=True))
     fixed = np.rint(np.ldexp(scene.means.double().numpy(), bits)).astype("<i4")
     largest, others = coding.smallest_three(coding.unit_quats(scene)[:, _XYZW])
@@ -338,9 +337,9 @@ def _coarse(coefficients: Array, bits: int) -> Array:
 
 
 def _from_fixed_point(parts: Array, bits: int) -> Array:
-    """Positions (N, 3) of three bytes each (N, 3, 3), the lowest first."""
+    """Positions (N, 3) from three bytes each, (N, 3, 3), lowest byte first."""
     low, middle, high = (parts[..., i].astype(np.int32) for i in range(3))
-    signed = (low | middle << 8 | high << 16) << 8 >> 8  # the upper bit becomes the sign
+    signed = (low | middle << 8 | high << 16) << 8 >> 8  # sign extension
     return np.ldexp(signed.astype(np.float32), -bits)
 
 
@@ -352,7 +351,7 @@ def _quats_of_three(packed: Array) -> Array:
 
 
 def _quats_of_four(packed: Array) -> Array:
-    """From version 3 on: which component is largest, and nine bits and a sign for each of the
+    """Version 3 and later: index of the largest component; nine bits and a sign for each of the
     others."""
     words = packed.view("<u4")
     levels = (

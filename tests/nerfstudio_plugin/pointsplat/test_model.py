@@ -101,7 +101,7 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
     ("changes", "message"),
     [
         ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or above"),
-        ({"by": "pup"}, "pup looks at a scene from poses; expected a method that needs none"),
+        ({"by": "pup"}, "pup needs views of the scene; expected a method that needs none"),
         (
             {"encoder": "concat", "use_position": False},
             "switches of the encoder 'dual'; encoder 'concat' expects both",

@@ -181,7 +181,7 @@ def test_flat_axes_and_an_offset_are_kept(tmp_path, caplog):
     head, table = read_rad((tmp_path / "a.rad").read_bytes())
     assert (
         head["comment"] == "Offset: 1000000.0 -2.5 300000.0"
-        and "lost in RAD: the offset" in caplog.text
+        and "lost in RAD: the position offset" in caplog.text
     )
     assert np.exp(table["scales"][-3:, 2]).max() == 0.0
 
