@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
+
+import tyro
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_if_larger, print_json, print_result, scene_result
 from pointsplat_ns.pipeline.options import PruneOptions
 from pointsplat_ns.system.terminal import say
+
+Jobs = Annotated[
+    int | None,
+    tyro.conf.arg(
+        help="for a scene larger than memory: number of processes that share its parts; by default "
+        "1."
+    ),
+]
 
 
 def prune(
@@ -15,7 +26,7 @@ def prune(
     how: options.Flat[PruneOptions],
     output: options.Output = None,
     force: options.Force = False,
-    jobs: options.Jobs = None,
+    jobs: Jobs = None,
     memory: options.Megabytes | None = None,
     verbose: options.Verbose = False,
     json_output: options.Json = False,

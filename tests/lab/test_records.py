@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 
+from lab.common.printing import put_between
 from lab.judge import ablation, large, record, tables_record
 from lab.judge.record import FOLDER as RECORD
 from lab.numerics import cases, report, stability
@@ -36,7 +37,7 @@ def test_the_table_of_the_readme_is_that_of_the_record_which_is_small():
     rows, _ = record.read(JUDGED)
     readme = record.ROOT / "README.md"
     text = readme.read_text("utf-8")
-    assert record.put_between(text, record.readme_table(rows), readme) == text
+    assert put_between(text, record.readme_table(rows), readme, record.README_TABLE) == text
 
 
 def test_both_programs_are_timed_at_each_budget_and_what_is_there_is_kept(

@@ -184,14 +184,14 @@ def test_the_differences_from_gsplat_are_those_that_the_page_lists():
     by_keyword = [
         name for name, parameter in ours.items() if parameter.kind is parameter.KEYWORD_ONLY
     ]
-    assert by_keyword == listed.pop("Arguments of its own")
+    assert by_keyword == listed.pop("Additional arguments")
     assert [*ours][: -len(by_keyword)] + listed.pop("Arguments not taken") == GSPLAT_TAKES
 
     view, K = camera_askew()
     scene = *splats_in_view(30, 0), view[None], K[None], 37, 29
     image, _, meta = rasterization(*scene, sh_degree=1)
     assert set(GSPLAT_RETURNS) - {*meta} == set(listed.pop("Not in meta"))
-    assert {*meta} - set(GSPLAT_RETURNS) == set(listed.pop("In meta besides"))
+    assert {*meta} - set(GSPLAT_RETURNS) == set(listed.pop("Additionally in meta"))
     given = dict(tile_size=32, sparse_grad=True, channel_chunk=1)
     again, *_ = rasterization(*scene, sh_degree=1, **given)
     assert image.any() and torch.equal(image, again)
