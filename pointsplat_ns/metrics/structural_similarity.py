@@ -9,6 +9,7 @@ agree.
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import math
 
@@ -17,8 +18,39 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.system.kernels import KERNELS, on_threads
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import DOUBLES
+
+
+class SimilarityStruct(Struct):
+    """``Similarity`` of ``structural_similarity.cpp``, which says what its members are."""
+
+    members = {
+        "image": FLOAT_POINTER,
+        "other": FLOAT_POINTER,
+        "window": FLOAT_POINTER,
+        "planes": ctypes.c_int64,
+        "height": ctypes.c_int64,
+        "row": ctypes.c_int64,
+        "step": ctypes.c_int64,
+        "bands": ctypes.c_int64,
+        "partials": FLOAT_POINTER,
+        "sums": DOUBLE_POINTER,
+        "grad": FLOAT_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+similarity_kernel = Function("pointsplat_similarity", SimilarityStruct, INT64_POINTER)
 
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window in pixels."""
@@ -137,7 +169,7 @@ def _call(
     grad: Tensor | None = None,
 ) -> None:
     planes, height, row, step, bands = shape
-    task = KERNELS.structs["Similarity"](
+    task = SimilarityStruct(
         image=image,
         other=other,
         window=_window(image.dtype, image.device),
@@ -150,4 +182,4 @@ def _call(
         sums=sums,
         grad=grad,
     )
-    on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)
+    on_threads(planes * bands > 1, similarity_kernel, task)
