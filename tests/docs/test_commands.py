@@ -149,14 +149,6 @@ def test_python_examples_run(page, cut_room, tmp_path, monkeypatch):
             exec(compile(block.text, block.where, "exec"), names)
 
 
-def test_readme_and_pages_for_users_are_short():
-    docs = ROOT / "docs"
-    folders = {docs, docs / "concepts", docs / "first_hour", docs / "guides"}
-    most = {ROOT / "README.md": 450, **{page: 900 for page in PAGES if page.parent in folders}}
-    counts = {page: len(page.read_text("utf-8").split()) for page in most}
-    assert not {str(page): count for page, count in counts.items() if count > most[page]}
-
-
 def test_options_named_in_text_exist(monkeypatch, capsys):
     programs = [("pointsplat", name) for name in EXAMPLES]
     programs += [
