@@ -1,5 +1,5 @@
-"""Checks the arguments of :func:`~pointsplat_ns.rendering.rasterization.rasterization`, not the values
-of tensors."""
+"""Checks the arguments of :func:`~pointsplat_ns.rendering.rasterization.rasterization`, not the
+values of tensors."""
 
 from __future__ import annotations
 

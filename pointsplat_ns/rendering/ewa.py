@@ -9,7 +9,8 @@ and ``J`` the Jacobian of the projection, the rows of ``J W`` are
 and ``P = J W R S`` (2 x 3) has the rows ``p1 = fx / z * (R^T a) * s`` and ``p2 = fy / z * (R^T b) *
 s``. The covariance is ``P P^T + eps2d I``. Its determinant is summed from squares, ``det = |p1 x
 p2|^2 + eps2d (|p1|^2 +
-|p2|^2) + eps2d^2``, so that a needle does not lose it to cancellation as ``xx yy - xy^2`` does in float32.
+|p2|^2) + eps2d^2``, so that a needle does not lose it to cancellation as ``xx yy - xy^2`` does in
+float32.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
     number is logged.
 
     Opacity logits of +-Inf (opacity 1 and 0) and log-scales of -Inf (a flat axis) can be drawn (see
-    :meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable`). They become +-30 and -87, which draw the
-    same in float32.
+    :meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable`). They become +-30 and -87, which draw
+    the same in float32.
     """
     usable = usable_part(scene)
     dropped = len(scene) - len(usable)

@@ -110,8 +110,8 @@ class Function:
 
     Args:
         name: its name in the file.
-        arguments: types of its arguments: types of ctypes, :class:`Pointer`, and classes of structs,
-            which it takes by address.
+        arguments: types of its arguments: types of ctypes, :class:`Pointer`, and classes of
+            structs, which it takes by address.
         result: type of its result; None if it has none.
     """
 

@@ -62,8 +62,8 @@ def sample_views(
 
     Candidates look at Gaussians at random, from distances at which these are small, or from places
     where SH suggest that photos were taken. Of the likely ones
-    (:mod:`pointsplat_ns.view_sampling.sampler`), the next view is always the one that shows most of what
-    earlier views do not show. Views complete each other, so ask for all of them at once.
+    (:mod:`pointsplat_ns.view_sampling.sampler`), the next view is always the one that shows most of
+    what earlier views do not show. Views complete each other, so ask for all of them at once.
 
     Args:
         scene: N Gaussians.

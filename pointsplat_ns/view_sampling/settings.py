@@ -1,8 +1,8 @@
 """The settings of looking: tuned numbers that results depend on, with their meaning and their unit.
 
 Numbers that results hardly depend on stand in their formula. A unit is a tenth of the diagonal of
-the scene's content, see :data:`~pointsplat_ns.view_sampling.content.UNITS`. ``lab/judge/ablation.py``
-measures what fields are worth.
+the scene's content, see :data:`~pointsplat_ns.view_sampling.content.UNITS`.
+``lab/judge/ablation.py`` measures what fields are worth.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class LookingSettings:
 
     min_size_evidence: float = 0.48
     """The same in scenes without SH, by the correlation of the logarithms of size and distance, for
-    the scene to be a capture (:func:`~pointsplat_ns.view_sampling.upright.upright_axis`). Captures from
-    outside reach 0.50 to 0.78, rooms, where any free place will do, 0.23 to 0.46."""
+    the scene to be a capture (:func:`~pointsplat_ns.view_sampling.upright.upright_axis`). Captures
+    from outside reach 0.50 to 0.78, rooms, where any free place will do, 0.23 to 0.46."""
 
     # Up (upright.py)
 

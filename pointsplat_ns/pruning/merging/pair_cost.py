@@ -194,8 +194,8 @@ class Flat(NamedTuple):
 
     def overlap(self, other: Flat, u: Tensor, v: Tensor) -> Tensor:
         """The integral of the product of two projections whose centres are (u, v) apart; the fast
-        form of :func:`~pointsplat_ns.pruning.merging.covariance.overlap`, for covariances that are not
-        nearly lines."""
+        form of :func:`~pointsplat_ns.pruning.merging.covariance.overlap`, for covariances that are
+        not nearly lines."""
         both = Flat(self.uu + other.uu, self.uv + other.uv, self.vv + other.vv)
         distance = (
             (both.vv * u * u - 2 * both.uv * u * v + both.uu * v * v) / both.area() / both.area()

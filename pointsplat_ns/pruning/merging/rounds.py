@@ -70,8 +70,8 @@ def merge(
     Gaussians too faint to be drawn are dropped first.
 
     Args:
-        scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable` are
-            dropped, unless ``k`` is N.
+        scene: N Gaussians. Those that are not
+            :meth:`~pointsplat_ns.scene.gaussians.Gaussians.usable` are dropped, unless ``k`` is N.
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
         views: views in which the result should look the same, such as the poses of the scene's
@@ -309,8 +309,8 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
 
 def _with_reference(step: Step, settings: MergeSettings) -> Step:
     """A step with renders that results are compared with, in every few pixels of pictures of the
-    middle size (:func:`~pointsplat_ns.rendering.comparison.sizes.sides_of`), unless there are some, too many
-    Gaussians, or no views."""
+    middle size (:func:`~pointsplat_ns.rendering.comparison.sizes.sides_of`), unless there are some,
+    too many Gaussians, or no views."""
     everyone = step.participants
     views = step.views
     if (

@@ -9,8 +9,8 @@ tolerance t, an error of its colour:
 - Other numbers change the Gaussian's shape. The L2 norm of the change, relative to that of the
   Gaussian, is d / (sqrt(2) s) for a shift by d along an axis of standard deviation s, sqrt(3/4) d
   for a log-scale, and
-  |a / b - b / a| d for a component of its quaternion, in the plane of two axes a and b. The colour changes by that
-  times the contrast of the Gaussian with what is around it.
+  |a / b - b / a| d for a component of its quaternion, in the plane of two axes a and b. The colour
+  changes by that times the contrast of the Gaussian with what is around it.
 
 A Gaussian is seen in about alpha s1 s2 of a picture's area, with s1 and s2 its largest standard
 deviations. Where the squared error of a picture is least for a number of bits, each Gaussian adds

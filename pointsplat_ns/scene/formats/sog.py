@@ -264,8 +264,8 @@ HOLDS = Holds(sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[
 
 def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
     """A scene that takes fewer bytes as SOG: its numbers are rounded
-    (:mod:`~pointsplat_ns.scene.formats.rounding`), and its SH above degree 0 are entries of a palette.
-    A tolerance of 0 leaves it."""
+    (:mod:`~pointsplat_ns.scene.formats.rounding`), and its SH above degree 0 are entries of a
+    palette. A tolerance of 0 leaves it."""
     if not tolerance or not len(scene):
         return scene
     steps = steps_of(scene, tolerance)

@@ -66,9 +66,9 @@ class _Head:
 
 
 def read_spz(path: Path | str) -> Gaussians:
-    """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.scene.read_scene` does. The axes
-    stay those of the file. Of SH degree 4, the highest band is left out, and extensions are not
-    read, which is logged. Raises SceneError if the file is of another kind or version, is
+    """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.scene.read_scene` does. The
+    axes stay those of the file. Of SH degree 4, the highest band is left out, and extensions are
+    not read, which is logged. Raises SceneError if the file is of another kind or version, is
     truncated, or declares more than it can hold."""
     path = require_file(path, "an SPZ file")
     with coding.damage_named(path, "SPZ"):
@@ -121,8 +121,8 @@ def encode_spz(scene: Gaussians, progress: Progress = silent, level: int = 9) ->
 
 def rounded_for_spz(scene: Gaussians, tolerance: float) -> Gaussians:
     """A scene that takes fewer bytes as SPZ: its numbers are rounded as by
-    :func:`~pointsplat_ns.scene.formats.rounding.rounded`, those of SH to at most 8 bits. A tolerance
-    of 0 leaves it."""
+    :func:`~pointsplat_ns.scene.formats.rounding.rounded`, those of SH to at most 8 bits. A
+    tolerance of 0 leaves it."""
     if not tolerance or not len(scene):
         return scene
     small = rounded(fitted(scene)[0], tolerance)
