@@ -8,6 +8,7 @@ torch blurs them in one batch, which takes about half the time. Tests check that
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import math
 
@@ -16,8 +17,39 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.system.kernels import KERNELS, on_threads
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import DOUBLES
+
+
+class SimilarityStruct(Struct):
+    """``Similarity`` of ``structural_similarity.cpp``, which says what its members are."""
+
+    members = {
+        "image": FLOAT_POINTER,
+        "other": FLOAT_POINTER,
+        "window": FLOAT_POINTER,
+        "planes": ctypes.c_int64,
+        "height": ctypes.c_int64,
+        "row": ctypes.c_int64,
+        "step": ctypes.c_int64,
+        "bands": ctypes.c_int64,
+        "partials": FLOAT_POINTER,
+        "sums": DOUBLE_POINTER,
+        "grad": FLOAT_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+similarity_kernel = Function("pointsplat_similarity", SimilarityStruct, INT64_POINTER)
 
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window, pixels."""
@@ -134,7 +166,7 @@ def _call(
     grad: Tensor | None = None,
 ) -> None:
     planes, height, row, step, bands = shape
-    task = KERNELS.structs["Similarity"](
+    task = SimilarityStruct(
         image=image,
         other=other,
         window=_window(image.dtype, image.device),
@@ -147,4 +179,4 @@ def _call(
         sums=sums,
         grad=grad,
     )
-    on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)
+    on_threads(planes * bands > 1, similarity_kernel, task)

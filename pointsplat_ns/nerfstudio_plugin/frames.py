@@ -187,8 +187,8 @@ def _undistorted(
 
 
 def _need_sound_cameras(dataset: InputDataset) -> None:
-    """Refuse cameras with NaN, infinity or a size of no photo, and photos of a scene that moves. Those without times
-    are taken to be of a still scene."""
+    """Refuse cameras with NaN, infinity or a size of no photo, and photos of a scene that moves.
+    Those without times are taken to be of a still scene."""
     cameras = dataset.cameras
     paths = dataset.image_filenames
     numbers = [cameras.camera_to_worlds.flatten(1), cameras.fx, cameras.fy, cameras.cx, cameras.cy]

@@ -1,7 +1,8 @@
-"""Checks the options of a training that nerfstudio does not check: those that end it in a traceback,
-or in a scene of NaN.
+"""Checks the options of a training that nerfstudio does not check: those that end it in a
+traceback, or in a scene of NaN.
 
-Rules go by the names of fields, wherever in the configuration they are. Every number must be finite.
+Rules go by the names of fields, wherever in the configuration they are. Every number must be
+finite.
 """
 
 from __future__ import annotations
@@ -147,6 +148,7 @@ def _numbers(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...
 
 
 def _flag(path: tuple[str, ...]) -> str:
-    """An option as it is typed; those of dataparsers stand without the names of what they are in."""
+    """An option as it is typed; those of dataparsers stand without the names of what they are
+    in."""
     path = path[-1:] if "dataparser" in path else path
     return "--" + ".".join(name.replace("_", "-") for name in path)

@@ -61,7 +61,8 @@ def compact_scene(
         The result. Its scenes are on the device of ``dense``.
 
     Raises:
-        BudgetError, SceneError, PointSplatError: as :func:`~pointsplat_ns.pipeline.prune_scene.prune_scene`.
+        BudgetError, SceneError, PointSplatError: as
+            :func:`~pointsplat_ns.pipeline.prune_scene.prune_scene`.
         SceneError: if the SH degree exceeds the refiner's.
         DataError: if the budget or ``sh`` needs views and there are none.
     """

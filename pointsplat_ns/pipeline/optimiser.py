@@ -7,6 +7,7 @@ The loss of a view is 0.8 RMSE + 0.2 (1 - SSIM). With L1 in place of the root me
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -22,9 +23,46 @@ from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import View
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
+from pointsplat_ns.system.kernels import (
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.system.threads import in_turn, most_threads, one_thread, one_thread_each
+
+
+class AdamStepStruct(Struct):
+    """``AdamStep`` of ``optimiser.cpp``, which says what its members are."""
+
+    members = {
+        "values": FLOAT_POINTER,
+        "gradient": FLOAT_POINTER,
+        "first": FLOAT_POINTER,
+        "second": FLOAT_POINTER,
+        "moved": FLOAT_POINTER,
+        "factors": FLOAT_POINTER,
+        "count": ctypes.c_int64,
+        "columns": ctypes.c_int64,
+        "kind": ctypes.c_int64,
+        "kinds": ctypes.c_int64,
+        "rate": ctypes.c_float,
+        "epsilon": ctypes.c_float,
+        "fresh": ctypes.c_float,
+        "kept_square": ctypes.c_float,
+        "fresh_square": ctypes.c_float,
+        "weight_sum": ctypes.c_float,
+        "square_weight_sum": ctypes.c_float,
+    }
+    _fields_ = c_fields(members)
+
+
+adam_kernel = Function("pointsplat_adam", AdamStepStruct, INT64_POINTER)
 
 RATES = {
     # times the extent of the scene: the final rate of 3DGS, as the scene has been trained
@@ -137,7 +175,7 @@ class Adam:
         beta, square_beta = self._settings.betas
         for kind, (name, values) in enumerate(scene.items()):
             self._damp(name, gradients[name])
-            task = KERNELS.structs["AdamStep"](
+            task = AdamStepStruct(
                 values=values.contiguous(),
                 gradient=gradients[name].contiguous(),
                 first=self._first[name],
@@ -156,7 +194,7 @@ class Adam:
                 weight_sum=self._weight_sum(0),
                 square_weight_sum=self._weight_sum(1),
             )
-            on_threads(len(values) >= SEVERAL, KERNELS.library.pointsplat_adam, task)
+            on_threads(len(values) >= SEVERAL, adam_kernel, task)
         return scene.replace(**moved)
 
     def state(self) -> dict[str, Tensor]:

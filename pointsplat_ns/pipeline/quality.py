@@ -1,10 +1,11 @@
 """How close a written scene is to the dense scene: one judgement, reported identically by commands,
 pages and pictures.
 
-Renders are compared in the views of :meth:`~pointsplat_ns.pipeline.view_provider.ViewProvider.whole`,
-at the size that people look at, in few of their pixels. For PSNR these are every k-th
-(:mod:`~pointsplat_ns.rendering.comparison.sizes`). SSIM needs neighbours, so it takes bands of rows of each
-view, at other heights in each.
+Renders are compared in the views of
+:meth:`~pointsplat_ns.pipeline.view_provider.ViewProvider.whole`, at the size that people look at,
+in few of their pixels. For PSNR these are every k-th
+(:mod:`~pointsplat_ns.rendering.comparison.sizes`). SSIM needs neighbours, so it takes bands of rows
+of each view, at other heights in each.
 """
 
 from __future__ import annotations

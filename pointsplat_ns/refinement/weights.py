@@ -18,7 +18,8 @@ from pointsplat_ns.system.files import one_line, require_memory, write_tensors
 REFINER_FORMAT = "pointsplat-refiner/1"
 
 SHIPPED_REFINER = Path(__file__).parent / "pretrained" / "refiner.safetensors"
-"""The shipped refiner of merged scenes; ``CARD.md`` beside it describes its training and results."""
+"""The shipped refiner of merged scenes; ``CARD.md`` beside it describes its training and
+results."""
 
 SHIPPED_FOR_SELECTIONS = Path(__file__).parent / "pretrained" / "selection.safetensors"
 """The shipped refiner of scenes pruned by a score; ``SELECTION.md`` beside it describes it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -15,8 +16,105 @@ from pointsplat_ns.rendering.constants import ALPHA_MIN, COMPENSATION_MIN
 from pointsplat_ns.rendering.ewa import Lens, Project, longest_axis
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import EPS2D, View, Views
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import (
+    ANY_POINTER,
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+
+
+class CameraStruct(Struct):
+    """``Camera`` of ``camera.h``, which says what its members are."""
+
+    members = {
+        "view": ctypes.c_double * 9,
+        "centre": ctypes.c_double * 3,
+        "near_view": ctypes.c_float * 9,
+        "fx": ctypes.c_float,
+        "fy": ctypes.c_float,
+        "cx": ctypes.c_float,
+        "cy": ctypes.c_float,
+        "width": ctypes.c_float,
+        "height": ctypes.c_float,
+        "near_plane": ctypes.c_float,
+        "far_plane": ctypes.c_float,
+        "radius_clip": ctypes.c_float,
+        "eps2d": ctypes.c_float,
+        "alpha_min": ctypes.c_float,
+        "least_ratio": ctypes.c_float,
+        "steepness": ctypes.c_float,
+        "longest": ctypes.c_float,
+        "low_x": ctypes.c_float,
+        "high_x": ctypes.c_float,
+        "low_y": ctypes.c_float,
+        "high_y": ctypes.c_float,
+        "antialiased": ctypes.c_int64,
+    }
+    _fields_ = c_fields(members)
+
+
+class SceneStruct(Struct):
+    """``Scene`` of ``camera.h``, which says what its members are."""
+
+    members = {
+        "means": FLOAT_POINTER,
+        "quats": FLOAT_POINTER,
+        "scales": FLOAT_POINTER,
+        "opacities": FLOAT_POINTER,
+        "count": ctypes.c_int64,
+    }
+    _fields_ = c_fields(members)
+
+
+class ProjectionStruct(Struct):
+    """``Projection`` of ``projection.cpp``, which says what its members are."""
+
+    members = {
+        "camera": CameraStruct,
+        "scene": SceneStruct,
+        "seen": ANY_POINTER,
+        "counts": INT64_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+class ProjectionGradientStruct(Struct):
+    """``ProjectionGradient`` of ``projection.cpp``, which says what its members are."""
+
+    members = {
+        "camera": CameraStruct,
+        "scene": SceneStruct,
+        "ids": INT64_POINTER,
+        "seen": ctypes.c_int64,
+        "grad_means2d": FLOAT_POINTER,
+        "grad_depths": FLOAT_POINTER,
+        "grad_cov2d": FLOAT_POINTER,
+        "grad_det": FLOAT_POINTER,
+        "grad_opacities": FLOAT_POINTER,
+        "grad_directions": FLOAT_POINTER,
+        "means": FLOAT_POINTER,
+        "quats": FLOAT_POINTER,
+        "scales": FLOAT_POINTER,
+        "opacities": FLOAT_POINTER,
+        "sums": DOUBLE_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+range_kernel = Function("pointsplat_range", result=ctypes.c_int64)
+seen_kernel = Function("pointsplat_seen", result=ctypes.c_int64)
+project_kernel = Function("pointsplat_project", ProjectionStruct, INT64_POINTER)
+project_backward_kernel = Function(
+    "pointsplat_project_backward", ProjectionGradientStruct, INT64_POINTER
+)
 
 
 @dataclass
@@ -163,7 +261,7 @@ def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
     rotation = tuple(view.flatten().tolist())
     steepness = lens.steepness()
     (low_x, high_x), (low_y, high_y) = lens.clamps()
-    return KERNELS.structs["Camera"](
+    return CameraStruct(
         view=rotation,
         centre=tuple(centre.tolist()),
         near_view=rotation,
@@ -190,8 +288,8 @@ def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
 
 
 def scene_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Struct:
-    """The Gaussians as a struct for kernels, from contiguous tensors."""
-    return KERNELS.structs["Scene"](
+    """The Gaussians of kernels, from contiguous tensors."""
+    return SceneStruct(
         means=means, quats=quats, scales=scales, opacities=opacities, count=len(means)
     )
 
@@ -200,7 +298,7 @@ def kept_rows(counts: Tensor) -> Tensor:
     """Rows of the visible Gaussians in the kernels' output, which are first in each range;
     ``counts`` (ranges,) int64."""
     before = torch.cumsum(counts, 0) - counts
-    starts = KERNELS.library.pointsplat_range() * torch.arange(len(counts), **INDICES) - before
+    starts = range_kernel() * torch.arange(len(counts), **INDICES) - before
     return torch.arange(int(counts.sum()), **INDICES) + starts.repeat_interleave(counts)
 
 
@@ -215,17 +313,15 @@ class CompiledProject(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, view, centre, lens: Lens):
-        library = KERNELS.library
         scene = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
         count = means.shape[0]
-        counts = torch.empty(-(-count // library.pointsplat_range()), **INDICES)
-        # each range starts at its first Gaussian
-        seen = torch.empty(count, library.pointsplat_seen() // 4, **FLOATS)
+        counts = torch.empty(-(-count // range_kernel()), **INDICES)
+        seen = torch.empty(
+            count, seen_kernel() // 4, **FLOATS
+        )  # each range's from where the range begins
         camera = camera_struct(view, centre, lens)
-        task = KERNELS.structs["Projection"](
-            camera=camera, scene=scene_struct(*scene), seen=seen, counts=counts
-        )
-        on_threads(count >= SEVERAL, library.pointsplat_project, task)
+        task = ProjectionStruct(camera=camera, scene=scene_struct(*scene), seen=seen, counts=counts)
+        on_threads(count >= SEVERAL, project_kernel, task)
 
         # fields of the struct Seen, in units of four bytes
         parts = seen.index_select(0, kept_rows(counts)).split([2, 2, 2, 1, 3, 1, 1, 3, 1], dim=1)
@@ -249,7 +345,6 @@ class CompiledProject(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, _ids, *given):
-        library = KERNELS.library
         ids, *scene = ctx.saved_tensors
         wanted = zip(
             ("means", "quats", "scales", "opacities"), scene, ctx.needs_input_grad, strict=False
@@ -257,7 +352,7 @@ class CompiledProject(torch.autograd.Function):
         out = {
             name: torch.empty_like(tensor) if needed else None for name, tensor, needed in wanted
         }
-        ranges = -(-scene[0].shape[0] // library.pointsplat_range())
+        ranges = -(-scene[0].shape[0] // range_kernel())
         # gradients of the camera's rotation by rows, then of its centre
         sums = torch.empty(ranges, 12, **DOUBLES) if any(ctx.needs_input_grad[4:6]) else None
         names = (
@@ -272,7 +367,7 @@ class CompiledProject(torch.autograd.Function):
             name: grad if grad is None else grad.contiguous()
             for name, grad in zip(names, given, strict=False)
         }
-        task = KERNELS.structs["ProjectionGradient"](
+        task = ProjectionGradientStruct(
             camera=ctx.camera,
             scene=scene_struct(*scene),
             ids=ids,
@@ -281,7 +376,7 @@ class CompiledProject(torch.autograd.Function):
             **grads,
             **out,
         )
-        on_threads(len(scene[0]) >= SEVERAL, library.pointsplat_project_backward, task)
+        on_threads(len(scene[0]) >= SEVERAL, project_backward_kernel, task)
         grad_view = grad_centre = None
         if sums is not None:
             # NumPy sums on one thread, so the rounding does not depend on the number of threads

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,8 +11,40 @@ from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.geometry.harmonics import C1, C2, C3, SH_C0, basis_rows
 from pointsplat_ns.geometry.transforms import unit_rows
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
+from pointsplat_ns.system.kernels import (
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import full_precision
+
+
+class ColorsStruct(Struct):
+    """``Colors`` of ``colors.cpp``, which says what its members are."""
+
+    members = {
+        "directions": FLOAT_POINTER,
+        "first": FLOAT_POINTER,
+        "rest": FLOAT_POINTER,
+        "rest_row": ctypes.c_int64,
+        "ids": INT64_POINTER,
+        "count": ctypes.c_int64,
+        "degree": ctypes.c_int64,
+        "colors": FLOAT_POINTER,
+        "grad_colors": FLOAT_POINTER,
+        "grad_directions": FLOAT_POINTER,
+        "grad_first": FLOAT_POINTER,
+        "grad_rest": FLOAT_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+color_kernel = Function("pointsplat_color", ColorsStruct, INT64_POINTER)
 
 
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
@@ -197,7 +231,7 @@ def _call_kernels(
     colors: Tensor,
     **grads: Tensor | None,
 ) -> None:
-    task = KERNELS.structs["Colors"](
+    task = ColorsStruct(
         directions=directions,
         first=first,
         rest=rest,
@@ -208,7 +242,7 @@ def _call_kernels(
         colors=colors,
         **grads,
     )
-    on_threads(len(ids) >= SEVERAL, KERNELS.library.pointsplat_color, task)
+    on_threads(len(ids) >= SEVERAL, color_kernel, task)
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:

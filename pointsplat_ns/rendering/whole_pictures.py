@@ -1,12 +1,14 @@
 """Images with compiled kernels (``compiled/whole_pictures.cpp``).
 
 Projection, colours and tiles take one pass over the Gaussians, followed by the usual blending
-(:mod:`~pointsplat_ns.rendering.compiled.blending_kernels`). Gradients of a scene's parameters take another
-pass. :func:`~pointsplat_ns.rasterization` gives the same images and gradients up to rounding.
+(:mod:`~pointsplat_ns.rendering.compiled.blending_kernels`). Gradients of a scene's parameters take
+another pass. :func:`~pointsplat_ns.rasterization` gives the same images and gradients up to
+rounding.
 """
 
 from __future__ import annotations
 
+import ctypes
 from typing import NamedTuple
 
 import torch
@@ -19,12 +21,70 @@ from pointsplat_ns.rendering.compiled import blending_kernels as blending
 from pointsplat_ns.rendering.compiled import tile_kernels as tiles
 from pointsplat_ns.rendering.constants import MEMORY_BUDGET
 from pointsplat_ns.rendering.ellipses import Grid, TileList
-from pointsplat_ns.rendering.projection import Camera, count_meaningless
+from pointsplat_ns.rendering.projection import (
+    Camera,
+    CameraStruct,
+    SceneStruct,
+    count_meaningless,
+    range_kernel,
+)
 from pointsplat_ns.rendering.quadratics import PIXELS
 from pointsplat_ns.rendering.spherical_harmonics import zeros_like
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+
+
+class PlacingStruct(Struct):
+    """``Placing`` of ``whole_pictures.cpp``, which says what its members are."""
+
+    members = {
+        "camera": CameraStruct,
+        "scene": SceneStruct,
+        "first": FLOAT_POINTER,
+        "rest": FLOAT_POINTER,
+        "rest_row": ctypes.c_int64,
+        "degree": ctypes.c_int64,
+        "most_color": ctypes.c_float,
+        "table": FLOAT_POINTER,
+        "ids": INT64_POINTER,
+        "depths": DOUBLE_POINTER,
+        "counts": INT64_POINTER,
+        "spoilt": INT64_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+class PlacingGradientStruct(Struct):
+    """``PlacingGradient`` of ``whole_pictures.cpp``, which says what its members are."""
+
+    members = {
+        "placing": PlacingStruct,
+        "ids": INT64_POINTER,
+        "drawn": ctypes.c_int64,
+        "sums": FLOAT_POINTER,
+        "means": FLOAT_POINTER,
+        "quats": FLOAT_POINTER,
+        "scales": FLOAT_POINTER,
+        "opacities": FLOAT_POINTER,
+        "first": FLOAT_POINTER,
+        "rest": FLOAT_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+place_kernel = Function("pointsplat_place", PlacingStruct, INT64_POINTER)
+place_back_kernel = Function("pointsplat_place_back", PlacingGradientStruct, INT64_POINTER)
 
 MOST_PAIRS = MEMORY_BUDGET // 16
 """Maximum number of pairs of Gaussian and tile in one pass, of 12 bytes each; larger images are
@@ -47,20 +107,19 @@ class _Placed(NamedTuple):
 def _placed(
     scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, taped: bool = False
 ) -> _Placed | None:
-    """The Gaussians that a camera sees, with or without colours, and with the lists for gradients
-    if ``taped``; None if there are more than :data:`MOST_PAIRS` pairs, or too little memory for
-    gradients of 192 bytes per pair."""
-    library = KERNELS.library
+    """What a camera sees, with or without colours, with all that gradients need if it is ``taped``;
+    None if the pairs are more than :data:`MOST_PAIRS`, or than gradients of 192 bytes each have
+    memory for."""
     count = len(scene)
     tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
     coefficients = scene.features_dc.contiguous(), scene.features_rest.contiguous()
     channels = 3 if colored else 0
     grid = Grid(camera.lens.width, camera.lens.height, alpha_min)
-    ranges = -(-count // library.pointsplat_range())
+    ranges = -(-count // range_kernel())
     table = torch.empty(count, 6 + channels, **FLOATS)
     depths = torch.empty(count, **DOUBLES)
     ids, counts, spoilt = (torch.empty(size, **INDICES) for size in (count, ranges, ranges))
-    task = KERNELS.structs["Placing"](
+    task = PlacingStruct(
         camera=projection.camera_struct(*camera),
         scene=projection.scene_struct(*tensors),
         first=coefficients[0],
@@ -74,7 +133,7 @@ def _placed(
         spoilt=spoilt,
         ids=ids,
     )
-    on_threads(count >= SEVERAL, library.pointsplat_place, task)
+    on_threads(count >= SEVERAL, place_kernel, task)
     rows = projection.kept_rows(counts)
     ids = ids[rows]
     order = ids[tiles.by_depth(projection.depths_behind_nearest(depths[rows]))]
@@ -127,10 +186,10 @@ class _Picture(torch.autograd.Function):
         names = ("means", "scales", "quats", "opacities", "first", "rest")
         wanted = zip(names, parameters, ctx.needs_input_grad[2:], strict=True)
         out = {name: zeros_like(value) if needed else None for name, value, needed in wanted}
-        task = KERNELS.structs["PlacingGradient"](
+        task = PlacingGradientStruct(
             placing=placed.task, ids=placed.ids, drawn=len(placed.ids), sums=sums, **out
         )
-        on_threads(len(parameters[0]) >= SEVERAL, KERNELS.library.pointsplat_place_back, task)
+        on_threads(len(parameters[0]) >= SEVERAL, place_back_kernel, task)
         return None, None, *out.values()
 
 

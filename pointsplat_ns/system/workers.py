@@ -6,12 +6,14 @@ import functools
 import os
 import pickle
 import signal
+import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import connection, get_context, util
+from multiprocessing import connection, get_context
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pointsplat_ns.errors import DataError, PointSplatError
@@ -100,6 +102,12 @@ def _end_with(ends: connection.Connection) -> None:
 
 _starting = threading.Lock()
 
+SAFE_PATH_VARIABLE = "PYTHONSAFEPATH"
+"""Environment variable by which Python, from 3.11 on, does not put the current folder on its
+path."""
+
+HAS_SAFE_PATH = sys.version_info >= (3, 11)
+
 
 @contextmanager
 def _started_safely(jobs: int) -> Iterator[None]:
@@ -108,30 +116,45 @@ def _started_safely(jobs: int) -> Iterator[None]:
     else their share of the cores.
 
     multiprocessing starts them and its resource tracker with ``python -c``, which puts the current
-    folder first on the path: files beside the scenes would be imported in place of Python's own
-    modules. Python 3.10 has no option against it. Ctrl-C would print a traceback of each process
-    that is still importing.
+    folder first on the path: what lies beside the scenes would be imported in place of Python's own
+    modules. Ctrl-C would show a traceback of each process that is still importing: they inherit
+    that it is blocked.
+
+    Raises:
+        PointSplatError: with Python 3.10, which has no option against it, if the current folder has
+            a file or folder with the name of one of Python's own modules.
     """
-
-    def start_safely(path: bytes, args: Sequence[str], passfds: Sequence[int]) -> int:
-        words = [*args]
-        at = words.index("-c") + 1
-        words[at] = (
-            # sys is part of the interpreter
-            f"import sys; sys.path = [*filter(None, sys.path)]; {words[at]}"
-        )
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-        try:
-            return start(path, words, passfds)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
+    if not HAS_SAFE_PATH:
+        _need_no_shadows(Path.cwd())
     threads = most_threads() if THREADS_VARIABLE in os.environ else max(1, cores() // jobs)
-    with _starting, fixed_threads(threads):
-        helpers: Any = util
-        start = helpers.spawnv_passfds
-        helpers.spawnv_passfds = start_safely
+    with _starting, fixed_threads(threads), _environment(SAFE_PATH_VARIABLE, "1"):
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
             yield
         finally:
-            helpers.spawnv_passfds = start
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _environment(name: str, value: str) -> Iterator[None]:
+    """Set an environment variable while the context is open."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+def _need_no_shadows(folder: Path) -> None:
+    """Raise PointSplatError if a file or folder has the name of one of Python's own modules."""
+    for path in sorted(folder.iterdir()):
+        if path.name.split(".")[0] in sys.stdlib_module_names:
+            raise PointSplatError(
+                f"{path}: Python 3.10 would import it in place of its own module in processes that "
+                "are started here; expected no such name; start the command in another folder, or "
+                "with Python 3.11"
+            )

@@ -147,8 +147,8 @@ def compact_folder(
             written.
         keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format.
         refiner: as for :func:`~pointsplat_ns.load_refiner`; None for no refiner.
-        by, opacity_weight, sh, clean, effort, seconds, target_db, resolution: as for :func:`compact`, for each
-            scene.
+        by, opacity_weight, sh, clean, effort, seconds, target_db, resolution: as for
+            :func:`compact`, for each scene.
         data: folder above the data of the runs. A run whose data is not found gets sampled views,
             and a note.
         target_format: suffix of all results, such as ".sog"; by default each result has the format

@@ -54,8 +54,9 @@ class SceneInfo:
     up_is_guess: bool
     """Whether it was estimated without evidence that agrees."""
     fill: float | None
-    """Mean number of Gaussians drawn per pixel (:func:`pointsplat_ns.rendering.comparison.fill.fill`) in
-    sampled views; None if there are none."""
+    """Mean number of Gaussians drawn per pixel
+    (:func:`pointsplat_ns.rendering.comparison.fill.fill`) in sampled views; None if there are
+    none."""
     views: str
     """Number and size of these views, as text."""
     sh_energies: list[float]

@@ -87,6 +87,26 @@ def test_unseen_photos_are_in_no_step_and_the_others_in_turn(
         (1e4, 0.4, 1.5, ["repair", "photos"], "gains less than 0.1 dB"),
     ],
 )
+def test_each_lap_has_the_photos_in_another_order_and_other_pixels(hollow_ball, monkeypatch):
+    taken = []
+
+    def every_kth(photo, side, device, generator):
+        taken.append((photo, generator.randrange(1 << 20)))
+        return photo
+
+    monkeypatch.setattr(module, "every_kth_pixel", every_kth)
+    photos_alone = dataclasses.replace(module.PHOTO_REPAIR, dense_every=10**9)
+    monkeypatch.setattr(module, "PHOTO_REPAIR", photos_alone)
+    numbered = dict(enumerate("abcdefg"))
+    found = module._examples(numbered, [*numbered], hollow_ball, FewViews(hollow_ball), 64)
+    for _ in range(3 * 7):
+        next(found)
+    names = "".join(name for name, _ in taken)
+    laps = [names[start : start + 7] for start in (0, 7, 14)]
+    assert all(sorted(lap) == [*"abcdefg"] for lap in laps) and len(set(laps)) == 3
+    assert len({offset for _, offset in taken}) == 21
+
+
 def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
     faster, unseen, most_lost, stages, text, hollow_ball, monkeypatch
 ):

@@ -197,6 +197,13 @@ def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
     assert first != second
 
 
+def test_each_lap_has_the_views_in_another_order(hollow_ball):
+    source = ViewProvider(hollow_ball, given=sample_views(hollow_ball, 40, 48, 36))
+    taken = [place(view.viewmat) for view in itertools.islice(source.others(), 28 * 3)]
+    laps = [tuple(taken[start : start + 28]) for start in (0, 28, 56)]
+    assert len(set(laps)) == 3
+
+
 def test_steps_draw_few_pixels_of_each_view_as_of_several_sizes(hollow_ball):
     source = ViewProvider(hollow_ball, given=sample_views(hollow_ball, 40, 640, 480))
     taken = list(itertools.islice(source.others(), 84))

@@ -140,9 +140,14 @@ def test_what_trainers_write_is_loaded(archived, tmp_path, checkpoint_of):
         "schedule": schedule.state_dict(),
         "module": torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.BatchNorm1d(2)).state_dict(),
         "types": [torch.ones(3, dtype=each) for each in types],
-        "views": [torch.zeros(4, 4)[1:, ::2], torch.zeros(0, 3), torch.zeros(()), torch.zeros(5).expand(7, 5)],
+        "views": [
+            torch.zeros(4, 4)[1:, ::2],
+            torch.zeros(0, 3),
+            torch.zeros(()),
+            torch.zeros(5).expand(7, 5),
+        ],
         "plain": [None, True, 1.5, -3, 2**70, "text", (1, (2, ()))],
-    }  # fmt: skip
+    }
     path.write_bytes(saved(value, _use_new_zipfile_serialization=archived))
     found = load_checkpoint(path)
     assert torch.equal(found["inria"][1], value["inria"][1])

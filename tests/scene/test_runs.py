@@ -14,41 +14,46 @@ from pointsplat_ns.scene.reading import read_scene, save
 from pointsplat_ns.scene.runs import open_run
 
 
-def test_a_run_of_nerfstudio_is_read_whole(make_run, tmp_path):
+def test_the_newest_checkpoint_of_a_run_is_found(make_run):
     folder = make_run(steps=(1999, 9999, 29999))
+    run = open_run(folder)
+    assert (run.folder, run.config_path) == (folder, folder / "config.yml")
+    assert run.checkpoint == folder / "nerfstudio_models" / "step-000029999.ckpt"
+    assert run.step == 29999
+
+
+def test_the_names_of_a_run_are_those_of_its_config(make_run):
+    run = open_run(make_run())
+    names = (run.method_name, run.experiment_name, run.timestamp)
+    assert names == ("splatfacto", "kitchen", "2024-05-06_070809")
+    assert run.is_gaussian_scene
+
+
+def test_the_data_and_dataparser_of_a_run_are_those_of_its_config(make_run, tmp_path):
+    run = open_run(make_run())
+    assert run.data == tmp_path / "data" / "kitchen"
+    module = "nerfstudio.data.dataparsers.nerfstudio_dataparser"
+    assert run.dataparser_class == f"{module}.NerfstudioDataParserConfig"
+    assert run.dataparser_fields["eval_mode"] == "fraction"
+    assert run.dataparser_fields["train_split_fraction"] == 0.9
+    assert not {"_target", "data"} & run.dataparser_fields.keys()
+
+
+def test_settings_of_a_run_are_those_of_its_config(make_run):
+    run = open_run(make_run())
+    assert run.datamanager_fields["camera_res_scale_factor"] == 1.0
+    assert "dataparser" not in run.datamanager_fields
+    names = ("sh_degree", "rasterize_mode", "background_color")
+    assert [run.model_fields[name] for name in names] == [3, "classic", "random"]
+    assert isinstance(run.model_fields["camera_optimizer"], Tagged)
+
+
+def test_the_transform_of_a_run_is_that_of_its_dataparser(make_run):
+    folder = make_run()
     transform = {"transform": [[1, 0, 0, 0.25], [0, 0, 1, -2], [0, -1, 0, 0]], "scale": 0.125}
     (folder / "dataparser_transforms.json").write_text(json.dumps(transform))
     run = open_run(folder)
-    assert run.folder == folder and run.config_path == folder / "config.yml"
-    assert (
-        run.checkpoint == folder / "nerfstudio_models" / "step-000029999.ckpt" and run.step == 29999
-    )
-    assert (run.method_name, run.experiment_name, run.timestamp) == (
-        "splatfacto",
-        "kitchen",
-        "2024-05-06_070809",
-    )
-    assert run.data == tmp_path / "data" / "kitchen"
-    assert (
-        run.dataparser_class
-        == "nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig"
-    )
-    assert (
-        run.dataparser_fields["eval_mode"] == "fraction"
-        and run.dataparser_fields["train_split_fraction"] == 0.9
-    )
-    assert not {"_target", "data"} & run.dataparser_fields.keys()
-    assert (
-        run.datamanager_fields["camera_res_scale_factor"] == 1.0
-        and "dataparser" not in run.datamanager_fields
-    )
-    settings = [
-        run.model_fields[name] for name in ("sh_degree", "rasterize_mode", "background_color")
-    ]
-    assert settings == [3, "classic", "random"]
-    assert isinstance(run.model_fields["camera_optimizer"], Tagged)
     assert run.transform.tolist() == transform["transform"] and run.scale == 0.125
-    assert run.is_gaussian_scene
 
 
 @pytest.mark.parametrize(

@@ -90,5 +90,6 @@ def test_searches_say_what_they_reached_and_what_it_cost():
 def test_sh_that_stays_and_that_goes():
     assert sh_text(ShCut(1, 1)) == "SH degree 1 kept"
     assert sh_text(ShCut(3, 1, lost=0.25, psnr=41.0)) == (
-        "SH degree 3 cut to 1: colours change 25% less with the view, 41.0 dB PSNR against all bands"
+        "SH degree 3 cut to 1: colours change 25% less with the view, 41.0 dB PSNR against all "
+        "bands"
     )

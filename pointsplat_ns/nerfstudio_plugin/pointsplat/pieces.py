@@ -221,8 +221,8 @@ def count_of(scene: DenseScene) -> int | None:
 def cut_scenes(
     scenes: Sequence[DenseScene], most: int, config: ScenesDataManagerConfig
 ) -> list[ScenePiece]:
-    """The pieces of readable scenes, of at most ``most`` Gaussians, in all cuts of the datamanager's
-    configuration. Each further cut has pieces of two thirds of the size."""
+    """The pieces of readable scenes, of at most ``most`` Gaussians, in all cuts of the
+    datamanager's configuration. Each further cut has pieces of two thirds of the size."""
     found: list[ScenePiece] = []
     for scene in scenes:
         dense = scene.dense(keep=True)

@@ -31,8 +31,8 @@ def without_poses(poses: object) -> bool:
 
 def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
     """Views from a file of cameras that lies beside a scene's file or above it, see
-    :func:`~pointsplat_ns.scene.camera_files.camera_files_near`; None if there is none that belongs to
-    the scene.
+    :func:`~pointsplat_ns.scene.camera_files.camera_files_near`; None if there is none that belongs
+    to the scene.
 
     The file is named in one line. It counts if the views show the scene sharp, and either a
     training wrote its poses in the scene's frame, or ``dataparser_transforms.json`` moves them.
@@ -126,7 +126,8 @@ class PosesFile:
                 "write the scene again from its run"
             )
         raise DataError(
-            f"{self.path}: {faults if like is None else like}; poses and scene are probably in different frames: {mend}"
+            f"{self.path}: {faults if like is None else like}; poses and scene are probably in "
+            f"different frames: {mend}"
         )
 
     def _photos(self) -> list[Photo]:

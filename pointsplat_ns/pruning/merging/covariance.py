@@ -8,14 +8,42 @@ its area.
 
 from __future__ import annotations
 
+import ctypes
+
 import torch
 from torch import Tensor
 
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.pieces import in_pieces
 from pointsplat_ns.system.tensors import DOUBLES
+
+
+class ShapesStruct(Struct):
+    """``Shapes`` of ``covariance.cpp``, which says what its members are."""
+
+    members = {
+        "log_scales": FLOAT_POINTER,
+        "quats": FLOAT_POINTER,
+        "rows": INT64_POINTER,
+        "count": ctypes.c_int64,
+        "cov": DOUBLE_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+covariances_kernel = Function("pointsplat_covariances", ShapesStruct, INT64_POINTER)
 
 MIN_DIVISOR = 1e-300
 """Lower bound of float64 denominators, to keep quotients finite; the smallest normal float64 is
@@ -45,10 +73,10 @@ def covariances_of(scene: Gaussians, rows: Tensor, compiled: bool | None = None)
     cov = torch.empty(len(rows), 6, **DOUBLES)
     scales = scene.scales.contiguous()
     quats = scene.quats.contiguous()
-    task = KERNELS.structs["Shapes"](
+    task = ShapesStruct(
         log_scales=scales, quats=quats, rows=rows.contiguous(), count=len(rows), cov=cov
     )
-    on_threads(len(rows) >= SEVERAL, KERNELS.library.pointsplat_covariances, task)
+    on_threads(len(rows) >= SEVERAL, covariances_kernel, task)
     return cov
 
 

@@ -38,6 +38,7 @@ scene's content, and bounded so that squares of products of four of them fit int
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 from typing import NamedTuple
 
@@ -48,10 +49,59 @@ from pointsplat_ns.pruning.merging.covariance import plane_axes, projected
 from pointsplat_ns.pruning.merging.pairs import growth
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
+from pointsplat_ns.system.kernels import (
+    FLOAT_POINTER,
+    INT32_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES, numbers
 from pointsplat_ns.system.threads import in_threads
+
+
+class PlanesStruct(Struct):
+    """``Planes`` of ``pair_cost.cpp``, which says what its members are."""
+
+    members = {
+        "axes": ctypes.c_double * 78,
+        "to_plane": ctypes.c_double * 234,
+        "triples": ctypes.c_int64 * 39,
+    }
+    _fields_ = c_fields(members)
+
+
+class CostsStruct(Struct):
+    """``Costs`` of ``pair_cost.cpp``, which says what its members are."""
+
+    members = {
+        "planes": PlanesStruct,
+        "background_decay": ctypes.c_double,
+        "min_cover": ctypes.c_double,
+        "max_opacity": ctypes.c_double,
+        "growth_exponent": ctypes.c_double,
+        "means": FLOAT_POINTER,
+        "cov": FLOAT_POINTER,
+        "alphas": FLOAT_POINTER,
+        "colours": FLOAT_POINTER,
+        "weights": FLOAT_POINTER,
+        "count": ctypes.c_int64,
+        "axes": ctypes.c_int64,
+        "neighbours": ctypes.c_int64,
+        "table": FLOAT_POINTER,
+        "near": INT32_POINTER,
+        "costs": FLOAT_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+projected_kernel = Function("pointsplat_projected", CostsStruct, INT64_POINTER)
+pair_costs_kernel = Function("pointsplat_pair_costs", CostsStruct, INT64_POINTER)
 
 TINY = 1e-30
 """Lower bound of float32 denominators, to keep quotients finite; the smallest normal float32 is
@@ -233,11 +283,11 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     count = len(state)
     costs = torch.empty(near.shape, **FLOATS)
     tables = {"axes": PLANE_AXES, "to_plane": TO_PLANE, "triples": TRIPLES}
-    planes = KERNELS.structs["Planes"](
+    planes = PlanesStruct(
         **{name: tuple(table.flatten().tolist()) for name, table in tables.items()}
     )
     names = ("background_decay", "min_cover", "max_opacity", "growth_exponent")
-    task = KERNELS.structs["Costs"](
+    task = CostsStruct(
         planes=planes,
         **{name: getattr(settings, name) for name in names},
         means=state.means,
@@ -252,6 +302,6 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
         near=near.contiguous(),
         costs=costs,
     )
-    for function in (KERNELS.library.pointsplat_projected, KERNELS.library.pointsplat_pair_costs):
+    for function in (projected_kernel, pair_costs_kernel):
         on_threads(count >= SEVERAL, function, task)
     return costs

@@ -16,6 +16,7 @@ square area.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -38,10 +39,45 @@ from pointsplat_ns.pruning.merging.pairs import growth
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import Participants, bounded_colours
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    INT32_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.pieces import in_pieces, pieces
 from pointsplat_ns.system.tensors import DOUBLES, add_rows, numbers
 from pointsplat_ns.system.threads import in_threads, in_turn
+
+
+class ChoiceStruct(Struct):
+    """``Choice`` of ``covariance.cpp``, which says what its members are."""
+
+    members = {
+        "means": DOUBLE_POINTER,
+        "cov": DOUBLE_POINTER,
+        "colours": FLOAT_POINTER,
+        "group": INT64_POINTER,
+        "near": INT32_POINTER,
+        "count": ctypes.c_int64,
+        "candidates": ctypes.c_int64,
+        "group_means": DOUBLE_POINTER,
+        "inverse": DOUBLE_POINTER,
+        "log_determinants": DOUBLE_POINTER,
+        "group_colours": DOUBLE_POINTER,
+        "colour_weight": ctypes.c_double,
+        "best": INT64_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+best_groups_kernel = Function("pointsplat_best_groups", ChoiceStruct, INT64_POINTER)
 
 
 class Members:
@@ -232,7 +268,7 @@ def best_groups(
         near = nearest(means)
         if KERNELS.usable_for(compiled, colours):
             best = torch.empty_like(own)
-            task = KERNELS.structs["Choice"](
+            task = ChoiceStruct(
                 means=means,
                 cov=cov,
                 colours=colours,
@@ -247,7 +283,7 @@ def best_groups(
                 group_colours=groups.colours,
                 colour_weight=colour_weight,
             )
-            on_threads(len(own) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task)
+            on_threads(len(own) >= SEVERAL, best_groups_kernel, task)
             result[these] = best
             return
         candidates = torch.cat([own[:, None], near], dim=1)  # (m, 7)

@@ -3,6 +3,7 @@ same in torch."""
 
 from __future__ import annotations
 
+import ctypes
 import math
 from typing import NamedTuple
 
@@ -13,8 +14,90 @@ from pointsplat_ns.rendering.alpha import CLAMPED
 from pointsplat_ns.rendering.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from pointsplat_ns.rendering.ellipses import Grid, TileList
 from pointsplat_ns.rendering.quadratics import MOMENTS, PIXELS
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import (
+    FLOAT_POINTER,
+    INT64_POINTER,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import FLOATS, INDICES
+
+
+class TaskStruct(Struct):
+    """``Task`` of ``blending.cpp``, which says what its members are."""
+
+    members = {
+        "table": FLOAT_POINTER,
+        "gaussians": INT64_POINTER,
+        "offsets": INT64_POINTER,
+        "chunks": INT64_POINTER,
+        "tiles": ctypes.c_int64,
+        "columns": ctypes.c_int64,
+        "top": ctypes.c_int64,
+        "width": ctypes.c_int64,
+        "height": ctypes.c_int64,
+        "channels": ctypes.c_int64,
+        "log2_alpha_min": ctypes.c_float,
+        "alpha_min": ctypes.c_float,
+        "alpha_max": ctypes.c_float,
+        "clamped_from": ctypes.c_float,
+        "transmittance_min": ctypes.c_float,
+        "image": FLOAT_POINTER,
+        "final_": FLOAT_POINTER,
+        "before": FLOAT_POINTER,
+        "blended": INT64_POINTER,
+        "grad_image": FLOAT_POINTER,
+        "grad_final": FLOAT_POINTER,
+        "sums": FLOAT_POINTER,
+        "absolute": ctypes.c_int64,
+    }
+    _fields_ = c_fields(members)
+
+
+chunk_kernel = Function("pointsplat_chunk", result=ctypes.c_int32)
+blend_kernel = Function("pointsplat_blend", TaskStruct, INT64_POINTER)
+differentiate_kernel = Function("pointsplat_differentiate", TaskStruct, INT64_POINTER)
+weigh_kernel = Function("pointsplat_weigh", TaskStruct, INT64_POINTER)
+gather_kernel = Function(
+    "pointsplat_gather",
+    FLOAT_POINTER,
+    INT64_POINTER,
+    INT64_POINTER,
+    INT64_POINTER,
+    ctypes.c_int64,
+    ctypes.c_int64,
+    FLOAT_POINTER,
+    INT64_POINTER,
+)
+tabulate_kernel = Function(
+    "pointsplat_tabulate",
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    ctypes.c_int64,
+    ctypes.c_int64,
+    FLOAT_POINTER,
+    INT64_POINTER,
+)
+chain_kernel = Function(
+    "pointsplat_chain",
+    FLOAT_POINTER,
+    ctypes.c_int64,
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    ctypes.c_int64,
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    FLOAT_POINTER,
+    INT64_POINTER,
+)
 
 
 class KernelTape(NamedTuple):
@@ -37,9 +120,7 @@ def inputs_of(
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
     table = colors.new_empty(count, 6 + channels)
-    on_threads(
-        count >= SEVERAL, KERNELS.library.pointsplat_tabulate, *tensors, count, channels, table
-    )
+    on_threads(count >= SEVERAL, tabulate_kernel, *tensors, count, channels, table)
     return table
 
 
@@ -57,7 +138,7 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
     ]
     on_threads(
         count >= SEVERAL,
-        KERNELS.library.pointsplat_chain,
+        chain_kernel,
         summed.data_ptr(),
         summed.stride(0),
         cov2d,
@@ -82,7 +163,7 @@ def task_of(
         chunks: (tiles + 1,) int64, start of each tile's chunks; ignored without a tape.
         top: first row of tiles.
     """
-    return KERNELS.structs["Task"](
+    return TaskStruct(
         table=table,
         gaussians=gaussians,
         offsets=offsets,
@@ -104,10 +185,9 @@ def task_of(
 def blend_region(
     grid: Grid, tiles: TileList, table: Tensor, image: Tensor, final: Tensor, keep_tape: bool
 ) -> KernelTape | None:
-    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); returns
-    the tape if requested."""
-    library = KERNELS.library
-    size = library.pointsplat_chunk()
+    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape
+    if it is wanted."""
+    size = chunk_kernel()
     chunks = torch.zeros_like(tiles.offsets)
     torch.cumsum(
         (tiles.offsets.diff() + (size - 1)).div_(size, rounding_mode="floor"), 0, out=chunks[1:]
@@ -121,7 +201,7 @@ def blend_region(
         blended=blended,
         before=before if keep_tape and len(before) else None,
     )
-    on_threads(tiles.gaussians.numel() >= SEVERAL, library.pointsplat_blend, task)
+    on_threads(tiles.gaussians.numel() >= SEVERAL, blend_kernel, task)
     return KernelTape(before, blended, chunks) if keep_tape else None
 
 
@@ -130,8 +210,8 @@ def weigh(task: Struct, pairs: Tensor, count: int) -> Tensor:
     table has no colours; ``pairs`` (P,) are rows of the table."""
     sums = torch.empty(pairs.numel(), **FLOATS)
     task.fill(sums=sums)
-    on_threads(len(sums) >= SEVERAL, KERNELS.library.pointsplat_weigh, task)
-    # one thread, in tile order
+    on_threads(len(sums) >= SEVERAL, weigh_kernel, task)
+    # one thread, in the order of the tiles
     return sums.new_zeros(count).index_add_(0, pairs, sums)
 
 
@@ -148,7 +228,6 @@ def differentiate_region(
     """Moments, colour gradients and absolute gradients of the Gaussians of a table from one region,
     (rows of the table, MOMENTS + D [+ 2]); undefined for Gaussians that are not in the tiles'
     order."""
-    library = KERNELS.library
     pairs = tiles.gaussians.numel()
     count = tiles.order.numel()
     columns = MOMENTS + table.shape[1] - 6 + (2 if absgrad else 0)
@@ -164,7 +243,7 @@ def differentiate_region(
         sums=sums,
         absolute=int(absgrad),
     )
-    on_threads(pairs >= SEVERAL, library.pointsplat_differentiate, task)
+    on_threads(pairs >= SEVERAL, differentiate_kernel, task)
 
     # the sum of each Gaussian's pairs, in tile order
     by_gaussian = torch.empty_like(tiles.places)
@@ -173,7 +252,7 @@ def differentiate_region(
     torch.cumsum(tiles.counts, 0, out=starts[1:])
     on_threads(
         pairs >= SEVERAL,
-        library.pointsplat_gather,
+        gather_kernel,
         sums,
         by_gaussian,
         starts,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from typing import cast
 
@@ -12,14 +13,55 @@ from torch import Tensor
 from pointsplat_ns.rendering.compiled.blending_kernels import inputs_of
 from pointsplat_ns.rendering.constants import SLACK
 from pointsplat_ns.rendering.ellipses import Ellipses, Grid, TileList
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import (
+    ANY_POINTER,
+    FLOAT_POINTER,
+    INT32_POINTER,
+    INT64_POINTER,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import INDICES
+
+
+class ListingStruct(Struct):
+    """``Listing`` of ``tiles.cpp``, which says what its members are."""
+
+    members = {
+        "table": FLOAT_POINTER,
+        "stride": ctypes.c_int64,
+        "order": INT64_POINTER,
+        "count": ctypes.c_int64,
+        "boxes": INT32_POINTER,
+        "height": ctypes.c_int64,
+        "rows": ctypes.c_int64,
+        "columns": ctypes.c_int64,
+        "top": ctypes.c_int64,
+        "bottom": ctypes.c_int64,
+        "log2_alpha_min": ctypes.c_float,
+        "slack": ctypes.c_float,
+        "strips": ANY_POINTER,
+        "offsets": INT64_POINTER,
+        "counts": INT64_POINTER,
+        "gaussians": INT64_POINTER,
+        "places": INT64_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+by_depth_kernel = Function("pointsplat_by_depth", FLOAT_POINTER, ctypes.c_int64, INT64_POINTER)
+boxes_kernel = Function("pointsplat_boxes", ListingStruct, INT64_POINTER)
+count_kernel = Function("pointsplat_count", ListingStruct)
+list_kernel = Function("pointsplat_list", ListingStruct)
 
 
 def by_depth(depths: Tensor) -> Tensor:
     """As :func:`pointsplat_ns.rendering.ellipses.by_depth`, for depths of at least 0."""
     order = torch.empty(len(depths), **INDICES)
-    KERNELS.library.pointsplat_by_depth(depths, len(depths), order)
+    by_depth_kernel(depths, len(depths), order)
     return order
 
 
@@ -35,14 +77,12 @@ def ellipses_of(
 def boxed(table: Tensor, order: Tensor, grid: Grid) -> Ellipses:
     """Ellipses of the Gaussians in the rows ``order``, (M,) int64, of a table, front to back."""
     found = Ellipses(order, table, torch.empty(len(order), 4, dtype=torch.int32, device="cpu"))
-    on_threads(
-        len(order) >= SEVERAL, KERNELS.library.pointsplat_boxes, _task(found, grid, 0, grid.rows)
-    )
+    on_threads(len(order) >= SEVERAL, boxes_kernel, _task(found, grid, 0, grid.rows))
     return found
 
 
 def _task(ellipses: Ellipses, grid: Grid, top: int, bottom: int, **lists: Tensor | None) -> Struct:
-    return KERNELS.structs["Listing"](
+    return ListingStruct(
         table=ellipses.shapes,
         stride=ellipses.shapes.shape[1],
         boxes=ellipses.boxes,
@@ -86,7 +126,7 @@ def listed(
         offsets=offsets,
         counts=counts if taped else None,
     )
-    KERNELS.library.pointsplat_count(task)
+    count_kernel(task)
     offsets = torch.cumsum(offsets, 0)
     total = int(offsets[-1])
     if total > most_pairs:
@@ -94,7 +134,7 @@ def listed(
     gaussians = torch.empty(total, **INDICES)
     places = torch.empty(total if taped else 0, **INDICES)
     task.fill(offsets=offsets, gaussians=gaussians, places=places if taped else None)
-    KERNELS.library.pointsplat_list(task)
+    list_kernel(task)
     return TileList(gaussians, offsets, places, counts, ellipses.order, top)
 
 

@@ -49,9 +49,10 @@ class FlightFrame:
     @staticmethod
     def of(scene: Gaussians, views: Views | None = None, up: Up | None = None) -> FlightFrame:
         """The frame of a scene, which also suits smaller versions of it. A flight starts at the
-        known view that shows most, see :func:`~pointsplat_ns.view_sampling.opening_views.opening_views`; by
-        default up is what the scene declares, that of the views, or estimated. Raises SceneError if
-        no Gaussian can be drawn, and DataError if none is visible."""
+        known view that shows most, see
+        :func:`~pointsplat_ns.view_sampling.opening_views.opening_views`; by default up is what the
+        scene declares, that of the views, or estimated. Raises SceneError if no Gaussian can be
+        drawn, and DataError if none is visible."""
         need_usable(scene)
         known = None if views is None or len(views) == 0 else views.spread(VIEW_COUNTS.opening)
         up = known_up(up, scene)

@@ -41,8 +41,8 @@ def pair_of(output: Path) -> Path:
 @torch.no_grad()
 def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Path) -> None:
     """Draw a scene and a smaller one side by side to a PNG file, which nobody named, in the view
-    that its page opens with; ``known`` are its views, if there are any. Raises DataError if nothing of the scene is
-    visible, and SceneError if the file cannot be written."""
+    that its page opens with; ``known`` are its views, if there are any. Raises DataError if nothing
+    of the scene is visible, and SceneError if the file cannot be written."""
     frame = FlightFrame.of(before, known)
     views = frame.views.resized(WIDTH)
     view = views.resized(round(max(views.width, views.height) * min(1.0, HEIGHT / views.height)))[0]

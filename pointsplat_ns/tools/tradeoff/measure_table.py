@@ -68,7 +68,8 @@ def measure_tradeoff(
         folder: where the figures (JSON) and the page go.
         keep: budgets, as for :func:`pointsplat_ns.prune`, but for a PSNR.
         within: the recommended point is the fastest that loses at most so much, dB: against photos,
-            or as much as is expected of its renders (:mod:`~pointsplat_ns.tools.tradeoff.recommend`).
+            or as much as is expected of its renders
+            (:mod:`~pointsplat_ns.tools.tradeoff.recommend`).
         by: methods, as for :func:`pointsplat_ns.prune`.
         repairs: some of "none", "quick" and "thorough", the efforts of
             :func:`pointsplat_ns.compact`, and "photos", its training on the photos.

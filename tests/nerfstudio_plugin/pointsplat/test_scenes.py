@@ -134,6 +134,30 @@ def test_a_step_depends_on_its_number_alone_and_processes_share_it(trained_walls
         assert together == alone
 
 
+def test_steps_of_one_scene_draw_different_photos(trained_walls):
+    manager = manager_of(trained_walls)
+    steps = [photos_of(manager, step) for step in range(24)]
+    for scene in manager.train_indices:
+        drawn = [tuple(photos) for found, photos in steps if found == scene]
+        assert len(drawn) == 12
+        assert len(set(drawn)) > 6  # of 12 draws of 2 of 10 photos, about 11 differ
+
+
+def test_epochs_have_the_scenes_in_different_orders(trained_walls):
+    manager = manager_of(trained_walls)
+    orders = {tuple(manager.scene_at(2 * epoch + i) for i in range(2)) for epoch in range(16)}
+    assert orders == {(0, 1), (1, 0)}
+
+
+def test_evaluations_show_different_photos(trained_walls, monkeypatch):
+    manager = manager_of(trained_walls)
+    frames = [*range(7)]
+    for scene in manager.scenes:
+        monkeypatch.setattr(scene, "frames", lambda split: frames)
+    shown = {manager.next_eval_image(step)[1][0] for step in range(0, 24, 2)}
+    assert len(shown) > 3
+
+
 POSES = ScenesDataManagerConfig(sampled_poses=6, sampled_size=(32, 24), seed=1)
 
 

@@ -197,6 +197,25 @@ def test_one_network_learns_at_several_budgets_and_shows_the_first(trained_walls
     assert len(model.eval().refine(0)) == round(0.5 * len(model.scenes[0].read_dense()))
 
 
+def test_steps_draw_different_random_numbers_and_a_step_always_the_same(trained_walls, tmp_path):
+    """What augmentation, backgrounds and budgets are drawn from."""
+    pipeline = small_config(trained_walls, tmp_path, 3).pipeline.setup(
+        device="cpu", test_mode="val"
+    )
+    pipeline.train()
+    drawn = {}
+
+    def losses(index, frames):
+        drawn.setdefault(step, []).append(float(torch.rand(())))
+        return {}, {}, {}
+
+    pipeline.model.losses = losses
+    for step in (0, 1, 2, 3, 2, 0):
+        pipeline.get_train_loss_dict(step)
+    assert len({values[0] for values in drawn.values()}) == 4
+    assert all(len(set(values)) == 1 for values in drawn.values())
+
+
 def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls, tmp_path):
     def losses(augment: bool) -> list[float]:
         config = small_config(trained_walls, tmp_path, 3, augment=augment)
