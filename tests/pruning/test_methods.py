@@ -219,7 +219,7 @@ def test_few_gaussians_of_many_are_asked_about_unless_they_are_called_so():
     ):
         assert resolve_keep(n, text) == kept
     assert resolve_keep(5000, 10) == 10
-    wanted = r"keep is 10, of 5,000 Gaussians; did you mean 10%\? Write 10gaussians if you mean that count"
+    wanted = r"keep is 10, of 5,000 Gaussians; did you mean 10%\? Write 10gaussians if you mean "
     with pytest.raises(BudgetError, match=wanted):
         resolve_keep(5000, "10")
 

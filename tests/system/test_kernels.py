@@ -177,7 +177,7 @@ def test_the_compiler_notices_a_wrong_declaration(wrong, tmp_path):
 @pytest.fixture(autouse=True, scope="module")
 def right_declarations():
     """Those of the package, in place of the wrong ones that this module makes."""
-    from pointsplat_ns.rendering.compiled.tiles import by_depth_kernel
+    from pointsplat_ns.rendering.compiled.tile_kernels import by_depth_kernel
 
     FUNCTIONS[by_depth_kernel.name] = by_depth_kernel
 
