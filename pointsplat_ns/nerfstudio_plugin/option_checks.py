@@ -70,6 +70,7 @@ RULES: Mapping[str, Bounds] = {
     "cull_screen_size": NOT_NEGATIVE,
     "split_screen_size": NOT_NEGATIVE,
     "max_gauss_ratio": POSITIVE,
+    "lpips_weight": NOT_NEGATIVE,
     "grid_shape": AT_LEAST_ONE,
     "rot_l2_penalty": NOT_NEGATIVE,
     "trans_l2_penalty": NOT_NEGATIVE,

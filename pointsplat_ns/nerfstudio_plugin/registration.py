@@ -8,9 +8,11 @@ that nobody can help.
 from __future__ import annotations
 
 import importlib
+import itertools
 import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -47,8 +49,19 @@ def errors_in_one_line() -> None:
             say(f"error: {error}", error=True)
         else:
             before(kind, error, traceback)
+            if hint := _export_hint(sys.argv):
+                print(hint, file=sys.stderr)
 
     sys.excepthook = print_error
+
+
+def _export_hint(words: list[str]) -> str:
+    """What to do when ``ns-export`` fails, as it does for runs of ``splatfacto`` where there is no
+    GPU or no data; empty for other commands."""
+    if not words or Path(words[0]).stem != "ns-export":
+        return ""
+    run = next((b for a, b in itertools.pairwise(words) if a == "--load-config"), "RUN")
+    return f"without nerfstudio, a GPU or photos: pointsplat export {run} -o scene.ply"
 
 
 def quiet_nerfstudio() -> None:

@@ -164,6 +164,8 @@ class StoppableTrainer(Trainer):
             keep_freed_memory()
         try:
             with self._no_folder_of_nothing():
+                if self.config.is_viewer_enabled() or self.config.is_viewer_legacy_enabled():
+                    self.base_dir.mkdir(parents=True, exist_ok=True)  # for the viewer's log
                 super().setup(test_mode)
                 if self.given_config is not None:
                     self.given_config.write_config()

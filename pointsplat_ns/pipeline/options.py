@@ -163,8 +163,9 @@ class ReductionOptions:
     method keeps Gaussians as they are: coverage (empties no region), paper (eq. 3), authors (the
     formula of its released code), opacity, random; lightgaussian and pup score by views of the
     scene."""
-    opacity_weight: float | None = None
-    """Lambda of paper and authors: the weight of opacity; by default the paper's 0.3."""
+    opacity_weight: Annotated[float | None, arg(aliases=("--lambda",))] = None
+    """Lambda of paper and authors, in [0, 1]: the weight of opacity against volume; by default the
+    paper's 0.3."""
     sh: Bands = "all"
     """SH bands to keep: all, up to a degree, or auto, the lowest degree whose renders reach 40
     dB."""

@@ -186,9 +186,9 @@ def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
     by = saved["by"]
     saved_weight = saved.get("opacity_weight")
     weight = None if saved_weight is None else float(saved_weight)
-    return PruneSettings(
-        float(saved["keep"]), by, weight if method_named(by).weighs_opacity else None
-    )
+    keep = saved["keep"]
+    keep = keep if isinstance(keep, str) else float(keep)
+    return PruneSettings.of(keep, by, weight if method_named(by).weighs_opacity else None)
 
 
 LATER_OPTIONS = ("enc_depths", "stem", "raw_inputs", "means_reach", "units", "norm")

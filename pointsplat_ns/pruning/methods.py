@@ -16,9 +16,9 @@ from pointsplat_ns.pruning.baselines import (
     opacity_score,
     random_score,
 )
-from pointsplat_ns.pruning.budget import Keep, resolve_keep
+from pointsplat_ns.pruning.budget import Keep, Megabytes, WithinPsnr, parse_keep, resolve_keep
 from pointsplat_ns.pruning.merging import merge
-from pointsplat_ns.pruning.paper import paper_score, select
+from pointsplat_ns.pruning.paper import ScoreError, paper_score, select
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
@@ -57,7 +57,7 @@ METHODS: dict[str, Method] = {
 
 def method_named(by: str, opacity_weight: float | None = None) -> Method:
     """The method called ``by``. Raises PointSplatError if it is unknown, or gets an opacity weight
-    that it does not use."""
+    that it does not use or that is not in [0, 1]."""
     if by not in METHODS:
         raise PointSplatError(f"no method is called {by!r}; expected one of {', '.join(METHODS)}")
     if opacity_weight is not None and not METHODS[by].weighs_opacity:
@@ -66,6 +66,8 @@ def method_named(by: str, opacity_weight: float | None = None) -> Method:
             f"opacity weight {opacity_weight:g}: {by} does not weigh opacity; leave it out, or "
             f"choose one of {weighing}"
         )
+    if opacity_weight is not None and not 0 <= opacity_weight <= 1:  # NaN fails too
+        raise ScoreError(f"lambda, the opacity weight, is {opacity_weight:g}; expected 0 to 1")
     return METHODS[by]
 
 
@@ -88,12 +90,27 @@ class PruneSettings:
                 f"keep is {keep:g}; expected a ratio above 0 and up to 1 (such as 0.3) or a whole "
                 "number of Gaussians (such as 50000)"
             )
-        if keep > 1:  # configuration files have floats for counts
+        if isinstance(keep, float) and keep > 1:  # configuration files write counts as floats
             object.__setattr__(self, "keep", int(keep))
         if method_named(self.by, self.opacity_weight).needs_views:
             raise PointSplatError(
                 f"{self.by} needs views of the scene; expected a method that needs none"
             )
+
+    @classmethod
+    def of(
+        cls, keep: str | float | int, by: str, opacity_weight: float | None = None
+    ) -> PruneSettings:
+        """The settings of a budget as it is typed, such as "10%"; see
+        :func:`~pointsplat_ns.pruning.budget.parse_keep`. Raises BudgetError if it is a size or a
+        PSNR."""
+        budget = parse_keep(keep) if isinstance(keep, str) else keep
+        if isinstance(budget, (Megabytes, WithinPsnr)):
+            raise BudgetError(
+                f"keep is {keep}; expected a percentage, a ratio or a count, as it is for several "
+                "scenes"
+            )
+        return cls(budget, by, opacity_weight)
 
     def prune(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Gaussians:
         """Prune a scene with these settings; see :func:`prune`."""

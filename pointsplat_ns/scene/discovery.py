@@ -14,10 +14,11 @@ from typing import Literal
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.formats import READABLE, format_named, format_to_read
+from pointsplat_ns.scene.inert_yaml import read_config
 from pointsplat_ns.scene.ply import read_ply
 from pointsplat_ns.scene.ply_header import read_header
 from pointsplat_ns.scene.reading import is_folder_of_scenes, is_scene_file
-from pointsplat_ns.scene.runs import RUN_FILES, Run, open_run, scene_name
+from pointsplat_ns.scene.runs import RUN_FILES, Run, is_refiner_method, open_run, scene_name
 from pointsplat_ns.system.files import file_stem, logger
 
 Supervision = Literal["auto", "photos", "dense"]
@@ -140,7 +141,8 @@ def find_runs(folder: Path | str) -> list[Run]:
             run = open_run(place, need_data=False)
         except SceneError as error:
             passed.append(str(error))
-            logger.warning("skipped: %s", error)
+            if not _trains_refiner(Path(place)):  # a training that goes on, or was interrupted
+                logger.warning("skipped: %s", error)
             continue
         if not run.is_gaussian_scene:
             passed.append(f"{run.folder}: method {run.method_name or 'unknown'}")
@@ -155,6 +157,15 @@ def find_runs(folder: Path | str) -> list[Run]:
             f"EXPERIMENT/METHOD/TIME/{RUN_FILES.config}{seen}"
         )
     return sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
+
+
+def _trains_refiner(folder: Path) -> bool:
+    """Whether a folder is that of a run that trains a refiner, with or without a checkpoint."""
+    try:
+        method = str(read_config(folder / RUN_FILES.config).fields.get("method_name") or "")
+    except SceneError:
+        return False
+    return is_refiner_method(method)
 
 
 def distinct(names: Iterable[str]) -> list[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from contextlib import suppress
 from dataclasses import dataclass
@@ -81,9 +82,7 @@ class Run:
     @property
     def is_refiner(self) -> bool:
         """Whether the checkpoint holds a refiner for many scenes."""
-        return self.method_name == METHOD_NAMES.refiner or self.method_name.startswith(
-            f"{METHOD_NAMES.refiner}-"
-        )
+        return is_refiner_method(self.method_name)
 
     @property
     def is_gaussian_scene(self) -> bool:
@@ -100,6 +99,11 @@ class Run:
         return (
             "antialiased" if self.model_fields.get("rasterize_mode") == "antialiased" else "classic"
         )
+
+
+def is_refiner_method(name: str) -> bool:
+    """Whether a method of nerfstudio trains refiners."""
+    return name == METHOD_NAMES.refiner or name.startswith(f"{METHOD_NAMES.refiner}-")
 
 
 def may_be_run(path: Path | str) -> bool:
@@ -253,22 +257,15 @@ def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str 
             f"{config_path}: names no data folder; expected the photos that the run was trained on"
         )
     if place is not None:
-        names = [name for name in named.parts if name not in (named.anchor, "..", "~")]
-        tried = [Path(place, *names[first:]) for first in range(len(names) + 1)]
-    else:
-        with suppress(RuntimeError):  # "~nobody": unknown user
-            named = named.expanduser()
-        home = folder.resolve()
-        tried = list(dict.fromkeys(above / named for above in (Path.cwd(), home, *home.parents)))
+        return _data_below(Path(place), named, config_path)
+    with suppress(RuntimeError):  # "~nobody": a user whom this machine does not know
+        named = named.expanduser()
+    home = folder.resolve()
+    tried = list(dict.fromkeys(above / named for above in (Path.cwd(), home, *home.parents)))
     for candidate in tried:
         with suppress(OSError):  # name too long, or folder not readable
             if candidate.exists():
                 return candidate
-    if place is not None:
-        raise SceneError(
-            f"{place}: no such folder; expected the data of {config_path}, once at {named}, or a "
-            "folder above"
-        )
     places = ", ".join(map(str, tried[:3])) + (
         f" and {len(tried) - 3} more above" if len(tried) > 3 else ""
     )
@@ -276,6 +273,54 @@ def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str 
         f"{config_path}: its data {named} is missing; tried {places}; pass its folder with --data "
         "DIR, or move the data back"
     )
+
+
+MOST_SEARCHED = 20_000
+"""Folders that are searched for the data of a run."""
+
+DATA_FOLDERS = frozenset({"images", "sparse", "colmap", "dslr", "iphone", "results", "rgb"})
+"""Folders that datasets consist of, where no file lies beside them."""
+
+
+def _data_below(place: Path, named: Path, config_path: Path) -> Path:
+    """The data of a run that was once at ``named``: below ``place``, by as many last names of that
+    path as possible, or ``place`` itself, whatever its name. Raises SceneError, which names the
+    run, if it is not there, or two places are equally good."""
+    names = [name for name in named.parts if name not in (named.anchor, "..", "~")]
+    wanted = f"expected the data of {config_path}, once at {named}, or a folder above"
+    if not place.exists():
+        raise SceneError(f"{place}: no such folder; {wanted}")
+    for first in range(len(names)):
+        with suppress(OSError):  # a name that is too long, a folder that may not be looked into
+            if (candidate := Path(place, *names[first:])).exists():
+                return candidate
+    found: dict[int, list[Path]] = {}
+    searched = 0
+    for folder, inner, files in os.walk(place):
+        searched += 1
+        if RUN_FILES.config in files or searched > MOST_SEARCHED:
+            inner.clear()
+            continue
+        inner[:] = sorted(name for name in inner if not name.startswith("."))
+        for name in {*inner, *files}.intersection(names[-1:]):
+            parts = Path(folder, name).parts
+            same = next(
+                (k for k in range(len(names)) if parts[-1 - k :] != tuple(names[-1 - k :])),
+                len(names),
+            )
+            found.setdefault(same, []).append(Path(folder, name))
+    best = found[max(found)] if found else []
+    if len(best) > 1:
+        raise SceneError(
+            f"{place}: {best[0]} and {best[1]} may both be the data of {config_path}, once at "
+            f"{named}; name one of them"
+        )
+    if best:
+        return best[0]
+    entries = [*place.iterdir()] if place.is_dir() else []
+    if place.is_file() or any(entry.is_file() or entry.name in DATA_FOLDERS for entry in entries):
+        return place
+    raise SceneError(f"{place}: nothing called {names[-1] if names else named} in it; {wanted}")
 
 
 def read_transforms(path: Path) -> tuple[Tensor, float]:

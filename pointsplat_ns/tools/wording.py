@@ -285,10 +285,10 @@ def _effect_text(effect: RuleEffect) -> str:
         return ""
     seen = views_text(effect.views)
     if math.isinf(effect.psnr):
-        return f"; renders of {seen} stay the same"
+        return f"; renders of the {seen} that decided stay the same"
     return (
-        f"; renders reach {effect.psnr:.1f} dB against the dense scene's, {effect.worst:.1f} dB in "
-        f"the worst of {seen}"
+        f"; of the {seen} that decided, renders reach {effect.psnr:.1f} dB against the dense "
+        f"scene's, {effect.worst:.1f} dB in the worst"
     )
 
 

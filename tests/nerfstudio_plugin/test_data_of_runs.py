@@ -54,6 +54,26 @@ def test_the_data_is_found_at_or_below_the_folder_that_is_named(runs, moved, tra
         ps.dataset_views(run, data=moved / "nowhere")
 
 
+def test_the_data_is_searched_for_below_the_folder_and_the_run_is_named_if_it_is_not_there(
+    runs, moved, trained_walls, tmp_path
+):
+    run = run_of(runs, "wall-a")
+    known = ps.dataset_views(run_of(trained_walls, "wall-a")).viewmats
+    (tmp_path / "disk" / "2026" / "captures").mkdir(parents=True)
+    place = moved.rename(tmp_path / "disk" / "2026" / "captures" / "replica")
+    disk = tmp_path / "disk"
+    assert torch.equal(ps.dataset_views(run, data=disk).viewmats, known), "four folders below"
+    renamed = (place / "wall").rename(place / "renamed")
+    with pytest.raises(SceneError, match="disk: nothing called wall in it; .*config.yml, once at"):
+        ps.dataset_views(run, data=disk)
+    assert torch.equal(ps.dataset_views(run, data=renamed).viewmats, known), "whatever its name"
+    for name in "ab":
+        shutil.copytree(renamed, disk / name / "wall")
+        shutil.copy(place / "cam_params.json", disk / name)
+    with pytest.raises(SceneError, match="may both be the data of .*config.yml"):
+        ps.dataset_views(run, data=disk)
+
+
 COMMANDS = {
     "prune": "RUN --keep 50% --by lightgaussian -o OUT/a.ply --json",
     "compact": "RUN --keep 50% --effort instant -o OUT/a.ply --json",

@@ -66,6 +66,23 @@ def test_an_input_error_ends_a_command_with_one_line_and_status_1():
     assert "errors_in_one_line()" in methods.read_text()
 
 
+def test_a_failed_export_of_nerfstudio_names_the_one_that_needs_no_gpu():
+    code = (
+        "import sys; sys.argv = {!r}\n"
+        "from pointsplat_ns.nerfstudio_plugin.registration import errors_in_one_line\n"
+        "errors_in_one_line()\n"
+        "assert False"
+    )
+    for program, named in (("/bin/ns-export", True), ("/bin/ns-eval", False)):
+        words = [program, "gaussian-splat", "--load-config", "outs/config.yml"]
+        run = subprocess.run(
+            [sys.executable, "-c", code.format(words)], capture_output=True, text=True
+        )
+        assert run.returncode == 1 and "AssertionError" in run.stderr
+        last = run.stderr.splitlines()[-1]
+        assert last.endswith("pointsplat export outs/config.yml -o scene.ply") == named
+
+
 def test_warnings_for_nerfstudio_are_hidden_and_all_others_are_printed():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -240,3 +240,26 @@ def test_a_size_keeps_as_many_as_fit_and_not_one_more(n, degree, megabytes):
     limit = math.floor(megabytes * 1e6)
     assert 1 <= k <= n and ply_bytes(k, degree) <= limit
     assert k == n or ply_bytes(k + 1, degree) > limit
+
+
+@pytest.mark.parametrize(
+    ("typed", "kept"),
+    [("10%", 0.1), ("0.3", 0.3), ("500", 500), ("10gaussians", 10), (0.5, 0.5), (40.0, 40)],
+)
+def test_a_budget_is_typed_for_a_training_as_for_the_command(typed, kept):
+    settings = PruneSettings.of(typed, "paper")
+    assert settings.keep == kept and isinstance(settings.keep, type(kept))
+
+
+def test_a_bare_small_number_is_no_count_of_a_large_scene_and_a_size_none_of_several():
+    scene = normal_scene(5000)
+    with pytest.raises(BudgetError, match="did you mean 10%"):
+        PruneSettings.of("10", "opacity").prune(scene)
+    assert len(PruneSettings.of("10gaussians", "opacity").prune(scene)) == 10
+    for keep in ("12MB", "auto:35"):
+        with pytest.raises(BudgetError, match="for several scenes"):
+            PruneSettings.of(keep, "paper")
+    with pytest.raises(
+        PointSplatError, match="lambda, the opacity weight, is 1.5; expected 0 to 1"
+    ):
+        PruneSettings.of("10%", "paper", 1.5)

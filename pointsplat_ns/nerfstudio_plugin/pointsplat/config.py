@@ -6,18 +6,26 @@ import copy
 import math
 import sys
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, cast
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import (
+    LocalWriterConfig,
+    LoggingConfig,
+    MachineConfig,
+    ViewerConfig,
+)
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils.writer import LocalWriter
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.model import take_network_of
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModelConfig, take_network_of
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.resuming import take_settings_of
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
+from pointsplat_ns.nerfstudio_plugin.pointsplat.verdict import selection_text
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
 from pointsplat_ns.scene.runs import METHOD_NAMES
 from pointsplat_ns.system.processes import (
@@ -44,6 +52,13 @@ steps on two rooms, a third room gained 0.4 dB at 1e-4 and 0.1 dB at 2e-4, and l
 pruned by the paper's score learn faster at 1e-3."""
 
 
+class SilentWriter(LocalWriter):
+    """In place of nerfstudio's table of rays per second: the trainer prints its own lines."""
+
+    def write_stats_log(self, step: int) -> None:
+        """Print nothing."""
+
+
 @dataclass
 class PointSplatTrainerConfig(StoppableTrainerConfig):
     """nerfstudio's trainer, for a number of steps or for a time"""
@@ -68,10 +83,28 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     """Start from the weights of a trained refiner, and take the options of its network: shipped,
     which has one for merging and one for selections, a .safetensors file, or a run."""
 
+    steps_per_eval_image: int = 100
+    """After so many steps, fixed views of each scene are measured, pruned and refined, held-out
+    scenes apart: in a line, in tensorboard and in training.csv. Less often if it would take more
+    than a twentieth of the time; 0 for never."""
     steps_per_eval_batch: Suppress[Fixed[int]] = 0  # nerfstudio's, without effect here
 
+    @property
+    def model_config(self) -> PointSplatModelConfig:
+        """Settings of the model."""
+        return cast(PointSplatModelConfig, self.pipeline.model)
+
+    @staticmethod
+    def usual_model(method: str | None) -> PointSplatModelConfig:
+        """Settings of the model that a method has if none is given."""
+        from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
+
+        configs = (pointsplat_config(), paper_config(), authors_config())
+        models = {config.method_name: config.model_config for config in configs}
+        return models.get(method, PointSplatModelConfig())
+
     def check(self) -> None:
-        """See the base class."""
+        """See the base class. A training that resumes takes settings of its checkpoint's run."""
         kind = self.machine.device_type
         number = self.machine.num_devices
         if kind != "cuda" and number > 1:
@@ -87,6 +120,12 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
                     f"--{name.replace('_', '-')} {value:g}: expected a finite number above 0"
                 )
         super().check()
+        model = self.model_config
+        checkpoint = self.checkpoint_to_load()
+        if checkpoint is not None:
+            take_settings_of(checkpoint, model, self.usual_model(self.method_name))
+        for keep in (model.keep, *model.more_keeps):
+            model.prune_settings(keep)
 
     def set_timestamp(self) -> None:
         """See the base class; processes that ``torchrun`` started are connected here."""
@@ -97,8 +136,9 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         connect_torchrun("nccl" if self.machine.device_type == "cuda" else "gloo")
 
     def print_to_terminal(self) -> None:
-        """As nerfstudio's, by the first process."""
+        """As nerfstudio's, by the first process; before, how scenes are pruned."""
         if rank() == 0:
+            print(selection_text(self.model_config.prune_settings()), flush=True)
             super().print_to_terminal()
 
     def save_config(self) -> None:
@@ -148,5 +188,8 @@ def pointsplat_config() -> PointSplatTrainerConfig:
         pipeline=PointSplatPipelineConfig(),
         optimizers=adam(REFINER_RATES, eps=1e-15, max_norm=2.0),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        logging=LoggingConfig(
+            local_writer=LocalWriterConfig(_target=SilentWriter, enable=True), profiler="none"
+        ),
         vis="tensorboard",
     )

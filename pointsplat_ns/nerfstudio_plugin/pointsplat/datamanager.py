@@ -110,6 +110,8 @@ class ScenesDataManager(DataManager):
         self.prune_settings: tuple[PruneSettings, ...] = ()
         """How the model prunes scenes: pieces of which too little is left are not trained on."""
         self.cache = MemoryCache.of(config.cache_gigabytes)
+        self.left_out: set[str] = set()
+        """Identities of the scenes that are there but whose photos are not found."""
         self.supervision, self.scenes = self._found_scenes(Path(config.data))
         names = [scene.name for scene in self.scenes]
         unknown = [name for name in config.eval_scenes if name not in names]
@@ -139,11 +141,12 @@ class ScenesDataManager(DataManager):
         if pieces and test_mode == "val":
             training = self._cut(pieces)
         held_out = (
-            ", ".join(config.eval_scenes)
-            or "no scene (held-out photos of the training scenes serve)"
+            f"evaluating on {', '.join(config.eval_scenes)}, never trained on"
+            if config.eval_scenes
+            else "no held-out scenes; evaluating on held-out photos of the training scenes"
         )
         targets = "photos" if self.supervision == "photos" else "renders of the dense scenes"
-        log(f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}")
+        log(f"training scenes: {training}; trained on {targets}; {held_out}")
         super().__init__()
 
     def _found_scenes(self, folder: Path) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
@@ -181,9 +184,10 @@ class ScenesDataManager(DataManager):
                     run = dataclasses.replace(
                         run, data=open_run(run.config_path, data=config.scene_data).data
                     )
-                except SceneError:
+                except SceneError as error:
                     has_photos = False
-                    missing.append(f"{run.config_path}: its data {run.data} is not there")
+                    why = f"{run.config_path}: its data {run.data} is not there"
+                    missing.append(why if config.scene_data is None else str(error))
                     what = "left out" if chosen == "photos" else "seen from sampled poses"
                     log(f"{name} is {what}: {missing[-1]}")
             scene = TrainedScene(name, run, self.cache, config, self.device, has_photos)
@@ -191,6 +195,8 @@ class ScenesDataManager(DataManager):
                 scene.need_photos_as_rendered("take --pipeline.datamanager.supervision dense")
             if has_photos or chosen == "dense":
                 scenes.append(scene)
+            else:
+                self.left_out.add(scene.identity)
         scenes += [
             DenseScene(name, path, self.cache, config, self.device) for name, path in plys.items()
         ]

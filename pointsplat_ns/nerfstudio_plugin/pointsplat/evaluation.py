@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import math
+import os
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from pointsplat_ns.errors import DataError
+from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
+from pointsplat_ns.nerfstudio_plugin.pointsplat.verdict import SceneGain, selection_text, verdict
+from pointsplat_ns.pipeline.options import CompactOptions
+from pointsplat_ns.pipeline.run import compact
+from pointsplat_ns.pruning import METHODS, PruneSettings, prune
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import write_picture
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.terminal import print_table, say
 from pointsplat_ns.system.threads import now
+from pointsplat_ns.view_sampling.sampler import sample_views
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel
@@ -29,6 +38,12 @@ if TYPE_CHECKING:
 METRICS = ("psnr", "ssim", "lpips")
 
 VARIANTS = ("dense", "pruned", "refined")
+"""What every scene is compared in."""
+
+COMPARED = "POINTSPLAT_COMPARE"
+"""Environment variable with further ways to make the scene as small, such as ``merge compact``."""
+
+COMPACT = "compact"
 
 PHOTOS = "photos"
 RENDERS = "dense renders"
@@ -36,6 +51,7 @@ RENDERS = "dense renders"
 
 COLUMNS = (
     ("psnr", "PSNR dB", 2),
+    ("gain", "gain dB", 2),
     ("ssim", "SSIM", 3),
     ("lpips", "LPIPS", 3),
     ("gaussians", "Gaussians", 0),
@@ -55,11 +71,9 @@ class SceneReport:
     views: int
     variants: dict[str, dict[str, Any]]
     """By variant: psnr (dB), ssim, lpips (None if it cannot be computed), gaussians, megabytes,
-    fps."""
+    fps, and gain: its PSNR less that of the pruned scene, dB."""
     per_view: dict[str, dict[str, list[float]]]
     """By variant and metric: one value per photo."""
-    last_picture: Tensor | None
-    """Photo and variants of the last view side by side, (H, W * (1 + variants), 3) in [0, 1]."""
     seen_in_training: bool = True
 
 
@@ -79,7 +93,6 @@ def evaluate_scene(
     DataError if there is no photo."""
     values: dict[str, dict[str, list[float]]] = {v: {m: [] for m in METRICS} for v in variants}
     seconds: dict[str, list[float]] = {v: [] for v in variants}
-    picture = None
     views = 0
     for camera, data in tracked(frames, f"evaluating {scene.name}", len(frames), progress):
         pictures: list[Tensor] = []
@@ -93,10 +106,11 @@ def evaluate_scene(
             for metric, measure in (("psnr", psnr), ("ssim", ssim), ("lpips", lpips)):
                 value = measure(rgb, photo)
                 values[name][metric] += [] if value is None else [float(value)]
-        picture = torch.cat(pictures, dim=1)
         if picture_folder is not None:
-            name = f"{scene.name}_{views:04d}.png"
-            write_picture(picture, picture_folder / name, named=False)
+            file = f"{scene.name}_{views:04d}.png"
+            said = [f"{name} {values[name]['psnr'][-1]:.1f} dB" for name in variants]
+            picture = labelled(pictures, ["photo" if scene.has_photos else "dense render", *said])
+            write_picture(picture, picture_folder / file, named=False)
         views += 1
     if views == 0:
         raise DataError(
@@ -106,15 +120,63 @@ def evaluate_scene(
     if any(len(per_view["lpips"]) < views for per_view in values.values()):
         for per_view in values.values():  # a mean over fewer views would not be comparable
             per_view["lpips"] = []
-    rows = {
+    rows: dict[str, dict[str, Any]] = {
         name: {metric: _mean(values[name][metric]) for metric in METRICS}
         | {"gaussians": len(gaussians), "megabytes": gaussians.megabytes}
         | {"fps": _finite(1.0 / statistics.median(seconds[name]))}
         for name, gaussians in variants.items()
     }
+    for row in rows.values():
+        row["gain"] = _difference(row["psnr"], rows["pruned"]["psnr"])
     return SceneReport(
-        scene.name, PHOTOS if scene.has_photos else RENDERS, views, rows, values, picture
+        name=scene.name,
+        reference=PHOTOS if scene.has_photos else RENDERS,
+        views=views,
+        variants=rows,
+        per_view=values,
     )
+
+
+def labelled(pictures: Sequence[Tensor], labels: Sequence[str]) -> Tensor:
+    """Pictures (H, W, 3) in [0, 1] side by side, with a label above each: (H + L, W * count, 3) on
+    the CPU."""
+    height, width = pictures[0].shape[:2]
+    size = min(max(9, width // 24), 28)
+    font = ImageFont.load_default(size)
+    bar = Image.new("RGB", (width * len(pictures), size + size // 2 + 2), (24, 24, 24))
+    draw = ImageDraw.Draw(bar)
+    for place, label in enumerate(labels):
+        for text in (label, label.rpartition(" ")[0], label.partition(" ")[0]):
+            if draw.textlength(text, font) <= width - 4:
+                break
+        draw.text((place * width + 4, size // 4), text, fill=(255, 255, 255), font=font)
+    top = torch.from_numpy(np.asarray(bar, np.float32) / 255)
+    return torch.cat([top, torch.cat([picture.cpu() for picture in pictures], dim=1)])
+
+
+def compared_variants(scene: DenseScene, dense: Gaussians, count: int) -> dict[str, Gaussians]:
+    """The scene by other ways at the same count, by their names: those that the environment
+    variable :data:`COMPARED` names, pruning methods or ``compact``. Views are those of training, or
+    sampled. Raises PointSplatError for another name."""
+    names = os.environ.get(COMPARED, "").replace(",", " ").split()
+    unknown = [name for name in names if name != COMPACT and name not in METHODS]
+    if unknown:
+        raise PointSplatError(
+            f"{COMPARED}: no way is called {unknown[0]}; expected some of {COMPACT}, "
+            f"{', '.join(METHODS)}"
+        )
+    if not names:
+        return {}
+    views = scene.views("train") if isinstance(scene, TrainedScene) else None
+    found = {}
+    for name in names:
+        if name == COMPACT:
+            options = CompactOptions(keep=count)
+            found[name] = compact(dense, options, views=views, progress=True).report.scene
+        else:
+            seen = views if views is not None else sample_views(dense, 12)
+            found[f"by {name}"] = prune(dense, count, name, seen)
+    return found
 
 
 def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
@@ -152,43 +214,68 @@ def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
 
 
 def print_summary(summary: dict[str, Any]) -> None:
-    """Print the results of ``ns-eval``: a table, and the reason if LPIPS is missing."""
+    """Print the results of ``ns-eval``: a table, the verdict, and the reason if LPIPS is
+    missing."""
     settings = summary["settings"]
     scenes = summary["scenes"]
     reference = summary["reference"]
     blocks = [
-        (name, "yes" if scene["seen_in_training"] else "never", scene)
+        (name, "yes" if scene["seen_in_training"] else "never", str(scene["views"]), scene)
         for name, scene in scenes.items()
     ]
     if len(blocks) > 1:
         means = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
-        blocks += [("average", seen, summary[key]) for seen, key in means if key in summary]
+        blocks += [("average", seen, "", summary[key]) for seen, key in means if key in summary]
+    variants = list(summary["average"])
     rows = [
         (
-            *((name, seen) if variant == VARIANTS[0] else ("", "")),
+            *((name, seen, views) if variant == VARIANTS[0] else ("", "", "")),
             variant,
-            *(
-                "-" if (value := scene[variant][key]) is None else f"{value:,.{digits}f}"
-                for key, _, digits in COLUMNS
-            ),
+            *(_cell(scene, variant, key, digits) for key, _, digits in COLUMNS),
         )
-        for name, seen, scene in blocks
-        for variant in VARIANTS
+        for name, seen, views, scene in blocks
+        for variant in variants
     ]
-    header = ("scene", "seen in training", "variant", *(title for _, title, _ in COLUMNS))
-    made = f"keep {settings['keep']}, by {settings['by']}, refiner {settings['size']}"
+    header = ("scene", "seen in training", "views", "variant", *(title for _, title, _ in COLUMNS))
+    pruning = {name: settings[name] for name in ("keep", "by", "opacity_weight")}
+    made = f"{selection_text(PruneSettings(**pruning))}; refiner {settings['size']}"
     print_table(
         header,
         rows,
         title=f"{made}; compared with {reference}",
-        left=(0, 1, 2),
-        section=len(VARIANTS),
+        left=(0, 1, 3),
+        section=len(variants),
     )
+    if said := verdict(gains_of(summary)):
+        print(said)
     others = [name for name, scene in scenes.items() if scene["reference"] != reference]
     if others:
         say(f"compared with {RENDERS}, and in no mean: {', '.join(others)}")
     if "lpips_note" in summary:
         say(f"no LPIPS: {summary['lpips_note']}")
+
+
+def gains_of(summary: dict[str, Any]) -> list[SceneGain]:
+    """Gains of the scenes of a summary that are in its means, and whose PSNR is finite."""
+    return [
+        SceneGain(
+            name=name,
+            trained_on=scene["seen_in_training"],
+            views=scene["views"],
+            pruned=scene["pruned"]["psnr"],
+            refined=scene["refined"]["psnr"],
+        )
+        for name, scene in summary["scenes"].items()
+        if scene["reference"] == summary["reference"] and scene["refined"]["gain"] is not None
+    ]
+
+
+def _cell(scene: dict[str, Any], variant: str, key: str, digits: int) -> str:
+    """A number of the table."""
+    value = scene[variant][key]
+    if value is None or (key == "gain" and variant in VARIANTS[:2]):
+        return "-"
+    return f"{value:+,.{digits}f}" if key == "gain" else f"{value:,.{digits}f}"
 
 
 def only_finite(values: dict[str, Any]) -> dict[str, float]:
@@ -201,6 +288,10 @@ def _average(reports: list[SceneReport]) -> dict[str, dict[str, float | None]]:
         name: {key: _mean([r.variants[name][key] for r in reports]) for key in row}
         for name, row in reports[0].variants.items()
     }
+
+
+def _difference(value: float | None, other: float | None) -> float | None:
+    return None if value is None or other is None else value - other
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

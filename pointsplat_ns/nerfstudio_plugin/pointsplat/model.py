@@ -6,9 +6,8 @@ of one scene.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -16,6 +15,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor
+from tyro.conf import arg
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
@@ -45,21 +45,26 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Which Gaussians are kept, and the network that repairs them"""
 
     _target: type = field(default_factory=lambda: PointSplatModel)
-    keep: float = 0.3
-    """Gaussians to keep: a ratio in (0, 1], or a count if above 1."""
-    more_keeps: tuple[float, ...] = ()
+    keep: str = "30%"
+    """Gaussians to keep, as of the command: a percentage (30%), a ratio (0.3), or a count (50000,
+    50k, 10gaussians)."""
+    more_keeps: tuple[str, ...] = ()
     """Further values of keep. Each training step draws one of all values at random, so that one
     network learns to repair scenes of several budgets. Evaluation uses keep."""
     augment: bool = False
     """Rotate, mirror and recolour each training scene at random, so that the network learns neither
     the up direction nor the colours of the training scenes. The target images do not change. A
     scene's neighbour tables are then computed anew at each step."""
-    by: str = "merge"
-    """Pruning method. merge replaces neighbours by one Gaussian each. The others keep the Gaussians
-    with the highest score: coverage, paper (eq. 3), authors, opacity or random."""
-    opacity_weight: float | None = None
-    """Lambda of paper and authors: the weight of opacity against volume; by default the paper's
-    0.3."""
+    by: str = "paper"
+    """Pruning method. paper keeps the Gaussians with the highest score of eq. 3; authors takes the
+    formula of the released code, and opacity, coverage and random are other scores. merge, which is
+    not the paper's, replaces neighbours by one Gaussian each. lightgaussian and pup score by views,
+    which a training does not have; pointsplat prune has them."""
+    opacity_weight: Annotated[
+        float | None, arg(aliases=("--lambda", "--pipeline.model.lambda"))
+    ] = None
+    """Lambda of paper and authors, in [0, 1]: the weight of opacity against volume; by default the
+    paper's 0.3."""
     size: Literal["tiny", "small", "full"] = "small"
     """Size of the network: full is the paper's and needs a GPU; small and tiny are for a CPU."""
     encoder: Literal["dual", "concat"] = "dual"
@@ -105,10 +110,11 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     sh_degree: ClassVar[int] = 3
     """Read by ``ns-export``: above 0, colours are SH coefficients. A scene may have any degree."""
 
-    def prune_settings(self, keep: float | None = None) -> PruneSettings:
-        """How scenes are pruned; ``keep`` is the config's own by default. Raises PointSplatError if
-        the settings fit no scene."""
-        return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
+    def prune_settings(self, keep: str | float | None = None) -> PruneSettings:
+        """How scenes are pruned; ``keep`` is the config's own by default, and a number in runs of
+        earlier versions. Raises PointSplatError if the settings fit no scene."""
+        keep = self.keep if keep is None else keep
+        return PruneSettings.of(keep, self.by, self.opacity_weight)
 
 
 def take_network_of(init: str, config: PointSplatModelConfig) -> None:
@@ -146,11 +152,6 @@ class PointSplatModel(SplatfactoModel):
         config = self.config
         for keep in (config.keep, *config.more_keeps):
             config.prune_settings(keep)
-        if not 0 <= config.lpips_weight < math.inf:  # NaN fails too
-            raise PointSplatError(
-                f"--pipeline.model.lpips-weight {config.lpips_weight:g}: expected a finite "
-                "number, 0 or above"
-            )
         manager: ScenesDataManager = self.kwargs["datamanager"]
         self.refiner = Refiner(preset(config.size, **network_options(vars(config))))
         if config.init is not None and manager.test_mode == "val":
@@ -198,7 +199,7 @@ class PointSplatModel(SplatfactoModel):
         }
 
     def pruned_scene(
-        self, index: int, dense: Gaussians | None = None, keep: float | None = None
+        self, index: int, dense: Gaussians | None = None, keep: str | float | None = None
     ) -> PrunedScene:
         """A pruned scene by its index, from memory if it was pruned before. ``dense`` are its
         Gaussians, if they have been read; ``keep`` is by default the config's. Raises a
@@ -225,7 +226,7 @@ class PointSplatModel(SplatfactoModel):
         """The refined scene; differentiable in training, cached in evaluation."""
         if self.training:
             self._refined = None
-            keeps = (self.config.keep, *self.config.more_keeps)
+            keeps: tuple[str | float, ...] = (self.config.keep, *self.config.more_keeps)
             # the first random number of a step, if there are several budgets
             drawn = int(torch.randint(len(keeps), (), device="cpu")) if len(keeps) > 1 else 0
             scene = self.pruned_scene(index, keep=keeps[drawn])

@@ -7,7 +7,7 @@ import dataclasses
 import random
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from nerfstudio.engine.callbacks import (
@@ -25,8 +25,13 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import (
     ScenesDataManager,
     ScenesDataManagerConfig,
 )
-from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import evaluate_scene, only_finite
+from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
+    compared_variants,
+    evaluate_scene,
+    only_finite,
+)
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.verdict import selection_text
 from pointsplat_ns.pipeline.trained_refiner import network_options
 from pointsplat_ns.refinement import save_refiner
 from pointsplat_ns.scene.runs import RUN_FILES
@@ -41,8 +46,6 @@ MODEL_METADATA = (
     "stem",
     "raw_inputs",
     "by",
-    "keep",
-    "more_keeps",
     "opacity_weight",
     "units",
     "norm",
@@ -53,6 +56,14 @@ MODEL_METADATA = (
     "lpips_net",
 )
 """Settings of the model in the metadata of a saved network."""
+
+
+@runtime_checkable
+class Reporting(Protocol):
+    """A trainer that reports what the training gained."""
+
+    def report(self) -> None:
+        """Print and draw it."""
 
 
 @dataclass
@@ -111,16 +122,20 @@ class PointSplatPipeline(VanillaPipeline):
         resumed."""
         self.seconds = 0.0
         """Duration of the training so far, also before it was resumed."""
+        if processes.rank() == 0:
+            print(selection_text(config.model.prune_settings()), flush=True)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What checkpoints hold beside weights and optimisers, for torch's ``state_dict``."""
         return {"trained_on": sorted(self.trained_on), "seconds": self.seconds}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Load the state of a checkpoint; logs which of its scenes are missing now."""
+        """Load the state of a checkpoint; logs which of its scenes are missing now. Scenes whose
+        photos are not found are there: the log has named them."""
         self.seconds = state.get("seconds", 0.0)
         self.trained_on |= set(state["trained_on"])
         gone = set(state["trained_on"]) - {scene.identity for scene in self.datamanager.scenes}
+        gone -= self.datamanager.left_out
         if gone:
             log(
                 f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} "
@@ -146,25 +161,6 @@ class PointSplatPipeline(VanillaPipeline):
         return outputs, losses, metrics | {"scene": index}
 
     @torch.no_grad()
-    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict, dict]:
-        """Metrics at one held-out photo, and an image of photo, pruned and refined side by side."""
-        training = self.training
-        self.eval()
-        index, frames = self.datamanager.next_eval_image(step)
-        variants = {
-            "pruned": self.model.pruned_scene(index).pruned,
-            "refined": self.model.refine(index),
-        }
-        scene = self.datamanager.scenes[index]
-        report = evaluate_scene(self.model, scene, variants, frames, ReportedLpips())
-        pixels = int(frames[0][0].height) * int(frames[0][0].width)
-        metrics: dict[str, Any] = {"num_rays": pixels}
-        for variant, values in report.variants.items():
-            metrics |= only_finite({f"{name}_{variant}": value for name, value in values.items()})
-        self.train(training)
-        return metrics, {"photo_pruned_refined": report.last_picture}
-
-    @torch.no_grad()
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
@@ -184,13 +180,13 @@ class PointSplatPipeline(VanillaPipeline):
             variants = {
                 "dense": dense.to(model.device),
                 "pruned": found.pruned,
+                **compared_variants(scene, dense, len(found.pruned)),
                 "refined": model.refiner(*found),
             }
             report = evaluate_scene(
                 model, scene, variants, scene.frames("test"), lpips, output_path, progress=True
             )
             report.seen_in_training = scene.identity in self.trained_on
-            report.last_picture = None
             reports.append(report)
         self.train(training)
         order = {scene.name: index for index, scene in enumerate(manager.scenes)}
@@ -211,10 +207,12 @@ class PointSplatPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Saves the network alone at the end of training, for use without the training scenes."""
+        """At the end of training, saves the network alone, for use without the training scenes, and
+        lets the trainer report."""
 
         def save(step: int) -> None:
             trainer = attributes.trainer
+            model = self.config.model
             of_trainer = ("method_name", "rate_factor", "schedule", "drop_at", "global_norm")
             if trainer is not None and processes.rank() == 0:
                 names = self.datamanager.training_names
@@ -225,9 +223,13 @@ class PointSplatPipeline(VanillaPipeline):
                         "steps": step + 1,
                         "scenes": ", ".join(names),
                         "supervision": self.datamanager.supervision,
-                        **{name: getattr(self.config.model, name) for name in MODEL_METADATA},
+                        "keep": model.prune_settings().keep,
+                        "more_keeps": [model.prune_settings(k).keep for k in model.more_keeps],
+                        **{name: getattr(model, name) for name in MODEL_METADATA},
                         **{name: getattr(trainer.config, name) for name in of_trainer},
                     },
                 )
+            if isinstance(trainer, Reporting):
+                trainer.report()
 
         return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], save)]

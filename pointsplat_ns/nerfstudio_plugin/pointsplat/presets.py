@@ -41,7 +41,7 @@ def _paper_model() -> PointSplatModelConfig:
     return PointSplatModelConfig(
         by="paper",  # eq. 3
         opacity_weight=0.3,  # details: lambda_alpha, for all datasets
-        keep=0.3,  # Table 1: 0.5, 0.3 and 0.1, each with a network of its own
+        keep="30%",  # Table 1: 0.5, 0.3 and 0.1, each with a network of its own
         size="full",  # details: five stages of 2, 2, 2, 4 and 2 blocks
         encoder="dual",  # eq. 4 to 6
         use_appearance=True,  # Table 4, model V

@@ -163,8 +163,8 @@ class TrainedScene(DenseScene):
         try:
             with photos_alone():
                 outputs = self._dataparser.get_dataparser_outputs(split=split)
-        except PointSplatError:
-            raise
+        except PointSplatError as error:
+            raise type(error)(f"{error} (read as the data of {self.run.folder})") from error
         except (
             Exception
         ) as error:  # nerfstudio's parsers check little: a damaged file can raise nearly anything

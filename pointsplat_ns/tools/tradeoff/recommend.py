@@ -62,15 +62,14 @@ def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> t
     best = fastest_within(points, within, trusted)
     other = next_best(points)
     if dense.against_photos is not None:
-        limit = f"loses at most {within:g} dB against held-out photos"
+        limit = f"that loses at most {within:g} dB against held-out photos"
         value = "" if other is None else f"loses {loss_of(other, dense):.2f} dB"
     else:
-        limit = f"has {psnr_within(within):.1f} dB against the dense scene"
-        limit += f", as a loss of {within:g} dB against photos needs"
+        limit = f"above {psnr_within(within):.1f} dB ({within:g} dB of loss against photos)"
         value = "" if other is None else f"has {other.against_dense.psnr:.1f} dB"
     if best is not dense:
-        what = "fastest point" if trusted else "point with the fewest Gaussians"
-        return best, f"the {what} that {limit}: {best.label}, {_figures(best, dense, trusted)}"
+        what = "fastest" if trusted else "smallest"
+        return best, f"{what} point {limit}: {best.label}, {_figures(best, dense, trusted)}"
     why = f"no {'faster' if trusted else 'smaller'} point {limit}"
     if other is not None:
         why += (

@@ -100,7 +100,7 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or above"),
+        ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or more"),
         ({"by": "pup"}, "pup needs views of the scene; expected a method that needs none"),
         (
             {"encoder": "concat", "use_position": False},
@@ -158,7 +158,8 @@ def test_the_printed_table_has_each_scene_and_mean(report, capsys):
     found, _ = report
     print_summary(found)
     shown = capsys.readouterr().out
-    assert "keep 0.5, by paper, refiner tiny; compared with photos" in shown
+    title = "selection: PointSplat's score (eq. 3), lambda 0.3, 50 %; refiner tiny; compared with photos"
+    assert title in shown and "dB in its own scenes, " in shown
     assert ("no LPIPS: no weights here" in shown) == ("lpips_note" in found)
     rows = [
         [cell.strip() for cell in line.split("│")[1:-1]]
@@ -176,8 +177,12 @@ def test_the_printed_table_has_each_scene_and_mean(report, capsys):
     ]
     for row, block in zip(rows, blocks, strict=True):
         dense = block["dense"]
-        assert row[2:5] == ["dense", f"{dense['psnr']:.2f}", f"{dense['ssim']:.3f}"]
-        assert row[6:8] == [f"{dense['gaussians']:,.0f}", f"{dense['megabytes']:.2f}"]
+        assert row[2] == (f"{block['views']}" if "views" in block else "")
+        assert row[3:7] == ["dense", f"{dense['psnr']:.2f}", "-", f"{dense['ssim']:.3f}"]
+        assert row[8:10] == [f"{dense['gaussians']:,.0f}", f"{dense['megabytes']:.2f}"]
+    for name, block in found["scenes"].items():
+        gain = block["refined"]["psnr"] - block["pruned"]["psnr"]
+        assert block["refined"]["gain"] == pytest.approx(gain) and f"{gain:+.2f}" in shown, name
 
 
 SCENES = pytest.mark.parametrize(("index", "name"), [(0, "wall-a"), (1, "wall-b")])
@@ -231,10 +236,9 @@ def test_a_report_has_the_settings_of_the_network_and_of_pruning(report):
         "encoder": "dual",
         "use_appearance": True,
         "use_position": True,
-        "norm": "scene",
+        "units": "scene",
         "stem": "conv",
         "raw_inputs": False,
-        "means_reach": 0.05,
         "keep": 0.5,
         "by": "paper",
         "opacity_weight": None,
@@ -249,11 +253,14 @@ def test_an_evaluation_leaves_the_model_as_it_was(evaluated, report):
     assert not evaluated.training and not evaluated.model.training
 
 
-def test_pictures_of_a_report_show_photo_dense_pruned_and_refined(report):
+def test_pictures_of_a_report_show_photo_dense_pruned_and_refined_below_labels(report):
     _, folder = report
     names = sorted(path.name for path in folder.iterdir())
     assert names == [f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)]
-    assert cv2.imread(str(folder / names[0])).shape == (48, 4 * 64, 3)
+    picture = cv2.imread(str(folder / names[0]))
+    assert picture.shape == (15 + 48, 4 * 64, 3)
+    for column in range(4):
+        assert picture[:15, 64 * column : 64 * (column + 1)].max() > 200, "a label over each"
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0])

@@ -89,7 +89,8 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(three_rooms, t
     assert equal(weights[1], weights[0]) and equal(states[1], states[0])
     moved = [name for name in weights[0] if not torch.equal(weights[2][name], weights[1][name])]
     assert any("running" in name for name in moved) and any("heads" in name for name in moved)
-    scene = trainer.pipeline.datamanager.scenes[metrics[1]["scene"]].name
+    manager = trainer.pipeline.datamanager
+    scene = manager.scenes[manager.scene_at(1)].name
     assert trainer.skipped == {scene: 1} and [m["skipped_steps"] for m in metrics] == [0, 1, 1]
     text = f"step 1 is skipped: {scene}: the loss l1 is nan (said once for each)"
     assert [call.args[0] for call in log.call_args_list if "skipped" in call.args[0]] == [text]
