@@ -206,7 +206,8 @@ class PointSplatTrainer(StoppableTrainer):
         for scene in sorted(measured.gains, key=lambda scene: not scene.trained_on):
             kind = "trained on" if scene.trained_on else "not trained on"
             say(
-                f"{scene.name} ({kind}): pruned {scene.pruned:.1f} -> refined {scene.refined:.1f} dB "
+                f"{scene.name} ({kind}): pruned {scene.pruned:.1f} -> refined {scene.refined:.1f} "
+                "dB "
                 f"({scene.gain:+.1f}) in {counted(scene.views, 'view')}"
             )
         say(verdict(measured.gains))

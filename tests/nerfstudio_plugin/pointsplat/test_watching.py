@@ -43,12 +43,14 @@ def gain_of(own: float | None, others: float | None) -> list[SceneGain]:
         (
             2.3,
             1.9,
-            "gains 2.3 dB in its own scenes, 1.9 dB in others: it carries over; more steps may gain more",
+            "gains 2.3 dB in its own scenes, 1.9 dB in others: it carries over; more steps may "
+            "gain more",
         ),
         (
             0.0,
             0.0,
-            "gains nothing in its own scenes, gains nothing in others: more steps, or higher rates (--rate-factor)",
+            "gains nothing in its own scenes, gains nothing in others: more steps, or higher "
+            "rates (--rate-factor)",
         ),
         (-1.0, None, "loses 1.0 dB in its own scenes: more steps, or higher rates (--rate-factor)"),
         (None, 0.5, "gains 0.5 dB in scenes that it was not trained on"),
