@@ -13,10 +13,9 @@ import re
 import signal
 import sys
 import threading
-import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn, TextIO, cast
+from typing import Annotated, Any, NoReturn, TextIO, Union, cast
 
 from pointsplat_ns.errors import PointSplatError, printable
 from pointsplat_ns.system.terminal import say
@@ -191,21 +190,25 @@ def _ignore_matplotlibrc() -> None:
         os.chdir(here)
 
 
-def _command(name: str, short: bool = False) -> Callable[..., None]:
-    """The function of a command, in the module of the same name, with each option of its docstring
-    on one line, as tyro's help and its completion in bash want it; if ``short``, with the first
-    sentence alone. It is a copy, because tyro unwraps wrappers."""
-    command: Any = getattr(importlib.import_module(f"{__package__}.{name}"), name)
-    same = types.FunctionType(
-        command.__code__, command.__globals__, command.__name__, command.__defaults__
-    )
-    same.__annotations__ = command.__annotations__
-    same.__kwdefaults__ = command.__kwdefaults__
-    text = inspect.getdoc(command) or ""
-    same.__doc__ = (
-        re.split(r"(?<=\.)\s", text, maxsplit=1)[0] if short else re.sub(r"\n {8,}", " ", text)
-    )
-    return same
+def _command(name: str) -> Callable[..., None]:
+    """The function of a command, in the module of the same name."""
+    return getattr(importlib.import_module(f"{__package__}.{name}"), name)
+
+
+def _subcommands(summaries: bool) -> Any:
+    """A type that tyro reads as all commands; described by the first sentence of their docstrings
+    if ``summaries``, for the list of commands."""
+    import tyro
+
+    kinds = []
+    for name in COMMANDS:
+        command = _command(name)
+        text = inspect.getdoc(command) or ""
+        first = re.split(r"(?<=\.)\s", text, maxsplit=1)[0] if summaries else None
+        kinds.append(
+            Annotated[Any, tyro.conf.subcommand(name=name, constructor=command, description=first)]
+        )
+    return Union[tuple(kinds)]  # noqa: UP007, of any number
 
 
 def program() -> NoReturn:
@@ -283,12 +286,8 @@ def _run(args: list[str]) -> None:
             else:
                 about = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them."
                 about += " `--version` prints the version."
-                commands = {
-                    name: _command(name, short=args in (["-h"], ["--help"])) for name in COMMANDS
-                }
-                tyro.extras.subcommand_cli_from_dict(
-                    commands, prog="pointsplat", description=about, args=args
-                )
+                kinds = _subcommands(summaries=args in (["-h"], ["--help"]))
+                tyro.cli(kinds, prog="pointsplat", description=about, args=args)
     except SystemExit as end:
         if not end.code and (text := after_help(args)):
             say("", *text.splitlines())

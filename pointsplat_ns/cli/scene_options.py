@@ -4,12 +4,14 @@ people write them."""
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import docstring_parser
 import tyro
+from tyro import MISSING
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -35,15 +37,25 @@ Flat = Annotated[Options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="", help
 """Options of a dataclass, without its name before theirs."""
 
 
+def _paragraphs(documented: Any) -> dict[str, str]:
+    """The text on each parameter or field of a docstring, as one paragraph."""
+    return {
+        part.arg_name: " ".join(part.description.split())
+        for part in docstring_parser.parse_from_object(documented).params
+        if part.description is not None
+    }
+
+
 def _field_docstrings(kind: type) -> dict[str, str]:
-    """The docstring of each field of a dataclass and its bases, each as one paragraph."""
+    """The docstring of each field of a dataclass and its bases, as one paragraph."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
-        for part in docstring_parser.parse_from_object(base).params:
-            if part.description is not None:
-                found[part.arg_name] = " ".join(part.description.split())
+        found |= _paragraphs(base)
     return found
 
+
+_COMMANDS = __name__.rpartition(".")[0]
+"""The package of the commands."""
 
 _VIEWS = _field_docstrings(ViewOptions)
 
@@ -181,21 +193,26 @@ def quantities() -> ConstructorRegistry:
     )
 
     @registry.struct_rule
-    def options_with_plain_help(info: StructTypeInfo) -> StructConstructorSpec | None:
-        """Options of a dataclass, with each docstring as one paragraph."""
-        kind = info.type
-        if not (isinstance(kind, type) and issubclass(kind, (ViewOptions, ReductionOptions))):
+    def with_plain_help(info: StructTypeInfo) -> StructConstructorSpec | None:
+        """Commands and dataclasses of options, with the help of each option as one paragraph."""
+        kind: Any = info.type
+        if inspect.isfunction(kind) and kind.__module__.startswith(_COMMANDS):
+            defaults = {
+                name: MISSING if parameter.default is parameter.empty else parameter.default
+                for name, parameter in inspect.signature(kind).parameters.items()
+            }
+            help_of = _paragraphs(kind)
+        elif isinstance(kind, type) and issubclass(kind, (ViewOptions, ReductionOptions)):
+            defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+            help_of = _field_docstrings(kind)
+        else:
             return None
         types = get_type_hints(kind, include_extras=True)
-        help_of = _field_docstrings(kind)
         fields = tuple(
             StructFieldSpec(
-                name=field.name,
-                type=types[field.name],
-                default=field.default,
-                helptext=help_of.get(field.name, ""),
+                name=name, type=types[name], default=default, helptext=help_of.get(name)
             )
-            for field in dataclasses.fields(kind)
+            for name, default in defaults.items()
         )
         return StructConstructorSpec(instantiate=kind, fields=fields)
 

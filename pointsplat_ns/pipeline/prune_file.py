@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import hashlib
 import time
@@ -133,8 +132,7 @@ def prune_file(
             "which `pointsplat convert` changes"
         )
     if options.sh.isdigit():
-        rows = copy.copy(rows)
-        rows.rest = min(rows.rest, (int(options.sh) + 1) ** 2 - 1)
+        rows = rows.with_sh_degree(int(options.sh))
     most = MEMORY.most
     if memory is not None:
         each = _row_bytes(rows) + MEMORY.cell

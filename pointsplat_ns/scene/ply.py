@@ -7,6 +7,7 @@ coefficients of red, then green, then blue. Normals are ignored and written as z
 
 from __future__ import annotations
 
+import copy
 import functools
 import io
 import re
@@ -82,6 +83,12 @@ class PlyRows:
     """Number of SH coefficients per channel beyond the constant one, as read."""
     traits: Traits
     """Properties that the file declares of the scene beside its Gaussians."""
+
+    def with_sh_degree(self, degree: int) -> PlyRows:
+        """The same rows, read with SH up to a degree."""
+        rows = copy.copy(self)
+        rows.rest = min(self.rest, (degree + 1) ** 2 - 1)
+        return rows
 
     def __init__(self, path: Path | str, warn: bool = True):
         self.path = path = require_file(path, "a 3DGS PLY file")

@@ -97,11 +97,12 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     @staticmethod
     def usual_model(method: str | None) -> PointSplatModelConfig:
         """Settings of the model that a method has if none is given."""
-        from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
+        from nerfstudio.configs.method_configs import all_methods  # which import this module
 
-        configs = (pointsplat_config(), paper_config(), authors_config())
-        models = {config.method_name: config.model_config for config in configs}
-        return models.get(method, PointSplatModelConfig())
+        config = all_methods.get(method or "")
+        if isinstance(config, PointSplatTrainerConfig):
+            return copy.deepcopy(config.model_config)
+        return PointSplatModelConfig()
 
     def check(self) -> None:
         """See the base class. A training that resumes takes settings of its checkpoint's run."""
