@@ -42,4 +42,4 @@ def test_jobs_is_for_a_folder_only_where_a_folder_is_taken():
         for option in options:
             if option.names == ("--jobs",):
                 takes_folder = "folder of scenes" in options[0].help
-                assert ("or a folder" in option.help) == takes_folder, command
+                assert ("for a folder" in option.help.lower()) == takes_folder, command

@@ -165,7 +165,7 @@ def test_options_named_in_text_and_promised_by_the_changelog_exist(monkeypatch, 
         if "lab." in str(words[2:])
     ]
     helps = "\n".join(help_of(words, monkeypatch, capsys) for words in programs)
-    known = set(re.findall(r"--[a-z][\w.-]*", helps)) | OF_OTHERS | {"--help"}
+    known = set(re.findall(r"--[a-z][\w.-]*", helps)) | OF_OTHERS | {"--help", "--version"}
     promised = (ROOT / "CHANGELOG.md").read_text("utf-8").partition("### Removed")[0]
     codes = [
         *inline_code(),
