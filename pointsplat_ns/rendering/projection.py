@@ -294,7 +294,7 @@ def scene_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor
     )
 
 
-def kept_rows(counts: Tensor) -> Tensor:
+def packed_rows(counts: Tensor) -> Tensor:
     """Rows of the visible Gaussians in the kernels' output, which are first in each range;
     ``counts`` (ranges,) int64."""
     before = torch.cumsum(counts, 0) - counts
@@ -324,7 +324,7 @@ class CompiledProject(torch.autograd.Function):
         on_threads(count >= SEVERAL, project_kernel, task)
 
         # fields of the struct Seen, in units of four bytes
-        parts = seen.index_select(0, kept_rows(counts)).split([2, 2, 2, 1, 3, 1, 1, 3, 1], dim=1)
+        parts = seen.index_select(0, packed_rows(counts)).split([2, 2, 2, 1, 3, 1, 1, 3, 1], dim=1)
         exact, ids, means2d, depths, cov2d, det, alphas, directions, radii = (
             part.contiguous() for part in parts
         )

@@ -134,7 +134,7 @@ def _placed(
         ids=ids,
     )
     on_threads(count >= SEVERAL, place_kernel, task)
-    rows = projection.kept_rows(counts)
+    rows = projection.packed_rows(counts)
     ids = ids[rows]
     order = ids[tiles.by_depth(projection.depths_behind_nearest(depths[rows]))]
     most = MOST_PAIRS // 12 if taped else MOST_PAIRS

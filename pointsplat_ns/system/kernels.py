@@ -71,22 +71,22 @@ def c_fields(members: dict[str, Any]) -> list[tuple[str, Any]]:
 class Struct(ctypes.Structure):
     """A struct of a C++ file. A subclass lists its members in ``members``, in the order of the
     file, and has ``_fields_ = c_fields(members)``; arrays are flat. :meth:`fill` sets pointers to
-    what :class:`Pointer` takes, and keeps tensors alive."""
+    the values that :class:`Pointer` accepts, and keeps references to tensors."""
 
     members: ClassVar[dict[str, Any]] = {}
     """Types of the members by name: a type of ctypes, another struct, or a :class:`Pointer`."""
 
     def __init__(self, **values: Any):
-        self.kept: dict[str, Any] = {}
+        self.references: dict[str, Any] = {}
         self.fill(**values)
 
     def fill(self, **values: Any) -> None:
-        """Set fields. Raises AttributeError if there is no such field, and TypeError if a value
-        does not fit its type."""
+        """Set fields. Raises AttributeError for an unknown field, and TypeError for a value of the
+        wrong type."""
         unknown = values.keys() - self.members.keys()
         if unknown:
             raise AttributeError(f"{type(self).__name__} has no member {sorted(unknown)[0]}")
-        self.kept.update(values)
+        self.references.update(values)
         for name, value in values.items():
             kind = self.members[name]
             setattr(self, name, kind.address(value) if isinstance(kind, Pointer) else value)

@@ -62,7 +62,7 @@ from pointsplat_ns.system.kernels import (
 )
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES, numbers
-from pointsplat_ns.system.threads import in_threads
+from pointsplat_ns.system.threads import parallel_for
 
 
 class PlanesStruct(Struct):
@@ -177,7 +177,7 @@ def pair_costs(
         )
         costs[rows] = total * state.weights[rows, None]
 
-    in_threads(fill, pieces(len(state), device, 1 << 14), device)  # 50 MB at a time
+    parallel_for(fill, pieces(len(state), device, 1 << 14), device)  # 50 MB at a time
     return costs
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.scene.formats import coding
-from pointsplat_ns.scene.formats.capacity import Holds, Span
+from pointsplat_ns.scene.formats.capacity import Capacity, Span
 from pointsplat_ns.scene.formats.coding import Array
 from pointsplat_ns.scene.formats.palette import LEVELS, codebook, palette
 from pointsplat_ns.scene.formats.rounding import (
@@ -193,7 +193,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
 
     levels, mins, maxs, _ = _levels_of(scene)
     steps = np.rint(levels).astype(np.int64)
-    scales, scale_index = codebook(scene.scales.clamp_min(HOLDS.sizes.low))  # -Inf of flat axes
+    scales, scale_index = codebook(scene.scales.clamp_min(CAPACITY.sizes.low))  # -Inf of flat axes
     colors, color_index = codebook(scene.features_dc)
     largest, others = coding.smallest_three(coding.unit_quats(scene))
     meta: dict[str, Any] = {
@@ -256,7 +256,9 @@ def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array, Tensor]:
     )
 
 
-HOLDS = Holds(sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[3].amax(dim=1))
+CAPACITY = Capacity(
+    sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[3].amax(dim=1)
+)
 
 
 def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
