@@ -3,8 +3,8 @@
 When torch shares an operation between threads, they busy-wait for one another at its end. Small
 operations end often: two threads take as long as one, and ten times as long if another program
 occupies one of the cores. Here torch uses one thread (:func:`one_thread_each`). Pieces of work
-(:func:`parallel_map`) and compiled kernels (:func:`pointsplat_ns.system.kernels.on_threads`) use all
-threads, which sleep while they wait.
+(:func:`parallel_map`) and compiled kernels (:func:`pointsplat_ns.system.kernels.on_threads`) use
+all threads, which sleep while they wait.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ _in_use: ContextVar[ViewSamplingSettings] = ContextVar(
 
 
 def current_settings() -> ViewSamplingSettings:
-    """The settings in use: :data:`DEFAULT_SETTINGS`, or those of the innermost :func:`use_settings`."""
+    """The settings of the innermost :func:`use_settings`; by default :data:`DEFAULT_SETTINGS`."""
     return _in_use.get()
 
 

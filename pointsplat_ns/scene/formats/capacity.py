@@ -1,8 +1,8 @@
 """The range of each attribute in a format, and the losses of a scene written in it.
 
-Each format declares its ranges (:class:`Capacity`). :func:`losses` compares a scene with them before
-it is written. Small losses that the format has by design, such as its steps of sizes, are not
-counted.
+Each format declares its ranges (:class:`Capacity`). Before a scene is written, :func:`losses`
+compares it with them. Small losses that the format has by design, such as its steps of sizes, are
+not counted.
 """
 
 from __future__ import annotations
