@@ -31,7 +31,7 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 
 class SimilarityStruct(Struct):
-    """``Similarity`` of ``structural_similarity.cpp``, which says what its members are."""
+    """``Similarity`` of ``structural_similarity.cpp``, which documents its members."""
 
     members = {
         "image": FLOAT_POINTER,

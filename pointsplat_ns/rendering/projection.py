@@ -32,7 +32,7 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 
 
 class CameraStruct(Struct):
-    """``Camera`` of ``camera.h``, which says what its members are."""
+    """``Camera`` of ``camera.h``, which documents its members."""
 
     members = {
         "view": ctypes.c_double * 9,
@@ -62,7 +62,7 @@ class CameraStruct(Struct):
 
 
 class SceneStruct(Struct):
-    """``Scene`` of ``camera.h``, which says what its members are."""
+    """``Scene`` of ``camera.h``, which documents its members."""
 
     members = {
         "means": FLOAT_POINTER,
@@ -75,7 +75,7 @@ class SceneStruct(Struct):
 
 
 class ProjectionStruct(Struct):
-    """``Projection`` of ``projection.cpp``, which says what its members are."""
+    """``Projection`` of ``projection.cpp``, which documents its members."""
 
     members = {
         "camera": CameraStruct,
@@ -87,7 +87,7 @@ class ProjectionStruct(Struct):
 
 
 class ProjectionGradientStruct(Struct):
-    """``ProjectionGradient`` of ``projection.cpp``, which says what its members are."""
+    """``ProjectionGradient`` of ``projection.cpp``, which documents its members."""
 
     members = {
         "camera": CameraStruct,
@@ -288,7 +288,7 @@ def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
 
 
 def scene_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Struct:
-    """The Gaussians of kernels, from contiguous tensors."""
+    """The Gaussians as a struct for kernels, from contiguous tensors."""
     return SceneStruct(
         means=means, quats=quats, scales=scales, opacities=opacities, count=len(means)
     )
@@ -316,9 +316,8 @@ class CompiledProject(torch.autograd.Function):
         scene = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
         count = means.shape[0]
         counts = torch.empty(-(-count // range_kernel()), **INDICES)
-        seen = torch.empty(
-            count, seen_kernel() // 4, **FLOATS
-        )  # each range's from where the range begins
+        # each range starts at its first Gaussian
+        seen = torch.empty(count, seen_kernel() // 4, **FLOATS)
         camera = camera_struct(view, centre, lens)
         task = ProjectionStruct(camera=camera, scene=scene_struct(*scene), seen=seen, counts=counts)
         on_threads(count >= SEVERAL, project_kernel, task)

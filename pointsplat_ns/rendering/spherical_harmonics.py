@@ -25,7 +25,7 @@ from pointsplat_ns.system.tensors import full_precision
 
 
 class ColorsStruct(Struct):
-    """``Colors`` of ``colors.cpp``, which says what its members are."""
+    """``Colors`` of ``colors.cpp``, which documents its members."""
 
     members = {
         "directions": FLOAT_POINTER,

@@ -1,8 +1,7 @@
 """Calls the package's C++ functions, which are compiled at installation, on several threads.
 
-A module that calls a kernel declares it: the structs that it takes as classes (:class:`Struct`),
-the function with the types of its arguments (:class:`Function`). Tests compare the declarations
-with those of the C++ files by a compiler.
+A module that calls a kernel declares its structs (:class:`Struct`) and its function with argument
+types (:class:`Function`). Tests compare the declarations with the C++ files, by a compiler.
 """
 
 from __future__ import annotations
@@ -27,8 +26,7 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 class Pointer:
-    """Type of a pointer, which takes contiguous tensors on the CPU, of one dtype or of any,
-    addresses and None."""
+    """Pointer type. Accepts contiguous CPU tensors, of one dtype or of any, addresses and None."""
 
     def __init__(self, dtype: torch.dtype | None):
         self.dtype = dtype
@@ -57,7 +55,7 @@ DOUBLE_POINTER = Pointer(torch.float64)
 INT32_POINTER = Pointer(torch.int32)
 INT64_POINTER = Pointer(torch.int64)
 ANY_POINTER = Pointer(None)
-"""Of structs, in a tensor of bytes."""
+"""Points to structs in a tensor of bytes."""
 
 
 def c_fields(members: dict[str, Any]) -> list[tuple[str, Any]]:
@@ -93,25 +91,25 @@ class Struct(ctypes.Structure):
 
     @classmethod
     def from_param(cls, value: Any) -> Any:
-        """What ctypes passes for an argument: the address of a struct of this class. Raises
-        TypeError for anything else."""
+        """Value that ctypes passes for an argument: the address of a struct of this class. Raises
+        TypeError for any other type."""
         if not isinstance(value, cls):
             raise TypeError(f"{type(value).__name__}; expected {cls.__name__}")
         return ctypes.byref(value)
 
 
 FUNCTIONS: dict[str, Function] = {}
-"""All that are declared, by name."""
+"""All declared functions by name."""
 
 
 class Function:
-    """A function of a C++ file, found in the library when it is first called.
+    """A function of a C++ file, looked up in the library at its first call.
 
     Args:
-        name: its name in the file.
-        arguments: types of its arguments: types of ctypes, :class:`Pointer`, and classes of
-            structs, which it takes by address.
-        result: type of its result; None if it has none.
+        name: name in the file.
+        arguments: argument types: ctypes types, :class:`Pointer`, and subclasses of
+            :class:`Struct`, which are passed by address.
+        result: result type; None if it returns nothing.
     """
 
     def __init__(self, name: str, *arguments: Any, result: Any = None):
@@ -154,7 +152,7 @@ class Kernels:
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
-        """The functions. Raises OSError if they were not built."""
+        """The loaded library. Raises OSError if it was not built."""
         return ctypes.CDLL(str(self._path))
 
     @functools.cached_property

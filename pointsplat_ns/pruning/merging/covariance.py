@@ -31,7 +31,7 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 
 class ShapesStruct(Struct):
-    """``Shapes`` of ``covariance.cpp``, which says what its members are."""
+    """``Shapes`` of ``covariance.cpp``, which documents its members."""
 
     members = {
         "log_scales": FLOAT_POINTER,

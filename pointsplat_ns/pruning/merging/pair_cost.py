@@ -66,7 +66,7 @@ from pointsplat_ns.system.threads import parallel_for
 
 
 class PlanesStruct(Struct):
-    """``Planes`` of ``pair_cost.cpp``, which says what its members are."""
+    """``Planes`` of ``pair_cost.cpp``, which documents its members."""
 
     members = {
         "axes": ctypes.c_double * 78,
@@ -77,7 +77,7 @@ class PlanesStruct(Struct):
 
 
 class CostsStruct(Struct):
-    """``Costs`` of ``pair_cost.cpp``, which says what its members are."""
+    """``Costs`` of ``pair_cost.cpp``, which documents its members."""
 
     members = {
         "planes": PlanesStruct,

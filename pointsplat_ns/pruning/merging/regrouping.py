@@ -57,7 +57,7 @@ from pointsplat_ns.system.threads import parallel_for, parallel_map
 
 
 class ChoiceStruct(Struct):
-    """``Choice`` of ``covariance.cpp``, which says what its members are."""
+    """``Choice`` of ``covariance.cpp``, which documents its members."""
 
     members = {
         "means": DOUBLE_POINTER,
