@@ -45,8 +45,7 @@ def import_tree() -> None:
 
 
 class _CpuTree:
-    """Equivalent of :class:`~pointsplat_ns.geometry.box_tree.BoxTree` for points (N, D) float64,
-    with scipy."""
+    """scipy's twin of :class:`~pointsplat_ns.geometry.box_tree.BoxTree`, points (N, D) float64."""
 
     def __init__(self, points: Tensor):
         from scipy.spatial import cKDTree

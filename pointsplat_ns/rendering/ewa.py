@@ -43,8 +43,7 @@ class Lens(NamedTuple):
     antialiased: bool
 
     def clamps(self) -> list[tuple[float, float]]:
-        """Bounds of x / z and y / z for the Jacobian, relative to the principal point (gsplat
-        #305)."""
+        """Bounds of x / z and y / z for the Jacobian, around the principal point (gsplat #305)."""
         bounds = []
         for side, focal, middle in (
             (self.width, self.fx, self.cx),
@@ -109,8 +108,7 @@ def _rotation_backward(
 
 
 def _cross(p: Tensor, q: Tensor) -> list[Tensor]:
-    """Cross product of rows (3, M). Each component uses two columns of P, so a needle's is
-    exact."""
+    """Cross product of rows (3, M): exact for needles, as components use two columns of P."""
     return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
 
 

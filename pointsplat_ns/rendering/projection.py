@@ -165,8 +165,7 @@ def camera_centre(viewmat: Tensor) -> Tensor:
 
 
 def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
-    """Whether numbers of a camera have the expected values, up to the rounding of an inverted
-    matrix."""
+    """Whether camera numbers have the expected values, up to the rounding of inversion."""
     return all(abs(value - right) <= 1e-5 for value, right in zip(values, wanted, strict=True))
 
 

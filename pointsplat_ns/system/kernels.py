@@ -79,8 +79,7 @@ class Struct(ctypes.Structure):
         self.fill(**values)
 
     def fill(self, **values: Any) -> None:
-        """Set fields. Raises AttributeError for an unknown field, and TypeError for a value of the
-        wrong type."""
+        """Set fields. Raises AttributeError for unknown fields, and TypeError for wrong types."""
         unknown = values.keys() - self.members.keys()
         if unknown:
             raise AttributeError(f"{type(self).__name__} has no member {sorted(unknown)[0]}")
@@ -192,8 +191,7 @@ class Kernels:
         return not why
 
     def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:
-        """Whether to use the kernels for these tensors: float32, on a CPU; ``wanted`` as for
-        :meth:`usable`."""
+        """Whether to use the kernels for these tensors: float32, on a CPU; see :meth:`usable`."""
         suited = all(
             tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors
         )

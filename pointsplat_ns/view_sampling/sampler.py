@@ -295,8 +295,7 @@ class Sampler:
         return look_at(target - distance[:, None] * ahead, target, up)
 
     def _from_places(self, count: int, generator: torch.Generator) -> Tensor:
-        """Cameras (count, 4, 4) near photo places, drawn by their shares, each looking at a
-        Gaussian."""
+        """Cameras (count, 4, 4) that look at Gaussians from near photo places, drawn by share."""
         up = self.up.direction
         traces = self._traces
         drawn = torch.multinomial(

@@ -18,8 +18,7 @@ class ViewSamplingSettings:
     """Settings of :mod:`pointsplat_ns.view_sampling`."""
 
     field_of_view: float = 70.0
-    """Field of view across the longer side of a sampled view, degrees: that of a phone's main
-    camera."""
+    """Field of view across a sampled view's longer side, degrees: a phone's main camera."""
 
     # Traces of photos (traces.py)
 

@@ -27,8 +27,7 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.view_sampling.settings import current_settings
 
 MIN_SH = 1e-4
-"""Length of an SH coefficient vector, root of the sum of squares, up to which it counts as
-untrained."""
+"""Length of an SH coefficient vector, root of the sum of squares, that counts as untrained."""
 
 
 def trace_factors(scene: Gaussians, members: Tensor) -> Tensor:
@@ -79,8 +78,7 @@ def factors_of(energy: Tensor, flatness: Tensor) -> Tensor:
 
 
 def _energy(sh: Tensor) -> Tensor:
-    """Sums of squares (n,) of SH coefficients (n, K, 3), clamped at 1,000; a colour of 1 is
-    white."""
+    """Sums of squares (n,) of SH coefficients (n, K, 3), clamped at 1,000; white is 1."""
     return sh.clamp(-1e3, 1e3).square().sum((1, 2))
 
 

@@ -66,8 +66,7 @@ def up_named(text: str | None) -> Up | None:
 
 
 def known_up(named: Up | None, scene: Gaussians) -> Up | None:
-    """The up direction without an estimate: the named one, or else the one declared by the scene's
-    file."""
+    """The up direction without an estimate: named, or else declared by the scene's file."""
     return named or up_named(scene.up)
 
 

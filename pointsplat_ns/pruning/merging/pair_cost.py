@@ -270,8 +270,7 @@ def costs_in_plane(
 
 
 def _within_bounds(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Means (m, 3) and covariances (m, 6) of rows (m,), clamped to 1000 sizes of the content,
-    float64."""
+    """Means (m, 3) and covariances (m, 6) of rows, float64, clamped to 1000 content sizes."""
     means = state.means[rows].double().clamp_(-1e3, 1e3)
     cov = state.cov[rows].double()
     total = cov[:, 0] + cov[:, 3] + cov[:, 5]

@@ -124,8 +124,7 @@ def seen_colours(dc: Tensor, rest: Tensor) -> Tensor:
 
 
 def _basis(count: int) -> Tensor:
-    """The first ``count`` basis functions above degree 0, (count, D) float64, in directions on a
-    spiral."""
+    """The first ``count`` basis functions above degree 0, (count, D) float64, on a spiral."""
     number = torch.arange(64, **DOUBLES)
     z = 1 - (2 * number + 1) / 64
     angle = number * math.pi * (3 - math.sqrt(5))

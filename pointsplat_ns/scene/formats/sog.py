@@ -149,8 +149,7 @@ def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
 
 
 def _looked_up(part: dict[str, Any], pixels: Array, channels: int) -> Array:
-    """Values (N, channels) float32 of bytes: codebook entries, or in version 1 shares between
-    bounds."""
+    """Values (N, channels) float32: codebook entries, or in version 1 shares between bounds."""
     book = part.get("codebook")
     if book is None:
         low, high = (np.broadcast_to(_numbers(part[name]), channels) for name in ("mins", "maxs"))
@@ -288,8 +287,7 @@ def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
     most = min(len(scene) // 2, 65_536)
 
     def made(share: float) -> tuple[Tensor, Tensor, float]:
-        """A palette of a given size, the entry index of each Gaussian, and the error of a
-        coefficient."""
+        """A palette of a given size, each Gaussian's entry, and the error of a coefficient."""
         book, index = palette(rows, 64 * max(int(share / 64), 1), each, lambda done: None)
         return (
             book,

@@ -355,8 +355,7 @@ def _quats_of_three(packed: Array) -> Array:
 
 
 def _quats_of_four(packed: Array) -> Array:
-    """Version 3 and later: index of the largest component; nine bits and a sign for each of the
-    others."""
+    """From version 3: index of the largest component; nine bits and a sign for the others."""
     words = packed.view("<u4")
     levels = (
         np.stack([words >> shift & 511 for shift in (20, 10, 0)], axis=1).astype(np.float32) / 511
