@@ -94,8 +94,7 @@ class MissingPackageError(PointSplatError):
 
 
 def need(package: Literal["nerfstudio"], what: str) -> None:
-    """Raise a MissingPackageError, which says ``what`` needs the package, if it cannot be
-    imported."""
+    """Raise a MissingPackageError, with ``what`` needs the package, unless it can be imported."""
     try:
         importlib.import_module(package)
     except ModuleNotFoundError as error:

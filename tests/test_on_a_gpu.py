@@ -19,7 +19,7 @@ from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.rendering.comparison.each_view import each_view
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.system.threads import fixed_threads
-from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS, use_settings
 from pretend_gpu import GPU, pretend_gpu
 
 NEAR = 1e-4
@@ -33,7 +33,9 @@ def several_threads():
     from few."""
     with (
         fixed_threads(4),
-        use_settings(replace(SHIPPED, candidates_per_view=1, min_candidates=4, evidence_count=100)),
+        use_settings(
+            replace(DEFAULT_SETTINGS, candidates_per_view=1, min_candidates=4, evidence_count=100)
+        ),
     ):
         yield
 

@@ -37,7 +37,7 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.system.files import replacing
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS, use_settings
 
 BASELINE = "default"
 """Name of the settings that all variants are compared with."""
@@ -126,17 +126,17 @@ def settings_of(views: int, width: int) -> dict[str, Any]:
     return (
         {"views": views, "width": width}
         | values
-        | {f"looking.{name}": v for name, v in vars(SHIPPED).items()}
+        | {f"looking.{name}": v for name, v in vars(DEFAULT_SETTINGS).items()}
     )
 
 
 @contextmanager
 def applied(changes: dict[str, Any]) -> Iterator[MergeSettings]:
-    """Settings of merging with changes. Those of looking are changed while the context is open."""
-    looking = {name: value for name, value in changes.items() if name in vars(SHIPPED)}
-    with use_settings(dataclasses.replace(SHIPPED, **looking)):
+    """Settings of merging with changes; inside of the context, those of view sampling change too."""
+    sampling = {name: value for name, value in changes.items() if name in vars(DEFAULT_SETTINGS)}
+    with use_settings(dataclasses.replace(DEFAULT_SETTINGS, **sampling)):
         yield dataclasses.replace(
-            MERGING, **{name: v for name, v in changes.items() if name not in looking}
+            MERGING, **{name: v for name, v in changes.items() if name not in sampling}
         )
 
 

@@ -16,7 +16,7 @@ import tyro
 from lab.common.printing import percent, save_figure, start
 from lab.tables.cells import Tables
 from lab.tables.figure import plot_figure
-from lab.tables.making import Maker, Refiners, Tools
+from lab.tables.make_scene import Maker, Refiners, Tools
 from lab.tables.scenes import Options, open_scene
 from lab.tables.ways import PROTOCOL, WAYS
 from pointsplat_ns.errors import PointSplatError

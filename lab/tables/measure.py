@@ -23,7 +23,7 @@ from lab.common.results import Row
 from lab.tables.cells import Tables
 from lab.tables.figure import distributions
 from lab.tables.layout import write_tables
-from lab.tables.making import Maker, Refiners, Tools
+from lab.tables.make_scene import Maker, Refiners, Tools
 from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.errors import PointSplatError, SceneError

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def lod(
     scene: options.Scene,
-    looking: options.Flat[ViewOptions],
+    view_options: options.Flat[ViewOptions],
     levels: tuple[str, ...] = ("50%", "25%", "10%", "3%"),
     output: options.Output = None,
     stream: bool = False,
@@ -65,7 +65,7 @@ def lod(
     from pointsplat_ns.scene.discovery import FOLDER_FILES
 
     options.need_one_scene(scene)
-    options.check_poses(looking.poses)
+    options.check_poses(view_options.poses)
     folder = output or options.output_beside(
         scene, "stream" if stream else "tiles" if tiles else "lod", ""
     )
@@ -75,10 +75,10 @@ def lod(
         ("100%", *levels) if for_viewers else levels,
         sh=sh,
         effort=effort,
-        views=looking.poses,
-        resolution=looking.resolution,
-        up=looking.up,
-        data=looking.data,
+        views=view_options.poses,
+        resolution=view_options.resolution,
+        up=view_options.up,
+        data=view_options.data,
         folder=folder,
         stream=stream,
         tiles=tiles,

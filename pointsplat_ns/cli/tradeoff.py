@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def tradeoff(
     scene: options.Scene,
-    looking: options.Flat[ViewOptions],
+    view_options: options.Flat[ViewOptions],
     output: options.Output = None,
     keep: tuple[str, ...] = ("70%", "50%", "30%", "20%", "10%", "5%"),
     within: float = 0.5,
@@ -50,7 +50,7 @@ def tradeoff(
     from pointsplat_ns.tools.tradeoff.recommend import next_best
     from pointsplat_ns.tools.wording import quality_line
 
-    options.check_poses(looking.poses)
+    options.check_poses(view_options.poses)
     folder = output or options.output_beside(scene, "tradeoff", "")
     found = ps.measure_tradeoff(
         scene,
@@ -60,10 +60,10 @@ def tradeoff(
         by=by,
         repairs=repairs,
         views=views,
-        poses=looking.poses,
-        resolution=looking.resolution,
-        up=looking.up,
-        data=looking.data,
+        poses=view_options.poses,
+        resolution=view_options.resolution,
+        up=view_options.up,
+        data=view_options.data,
         photos=photos,
         force=force,
         progress=True,

@@ -8,7 +8,7 @@ from torch import Tensor
 from pointsplat_ns.geometry.box_tree import BoxTree
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import FLOATS, numbers
-from pointsplat_ns.system.threads import in_threads, most_threads
+from pointsplat_ns.system.threads import most_threads, parallel_for
 
 QUERIES_AT_ONCE = 1 << 14
 """Number of points per search in a thread, to limit memory; eight times as many on a GPU."""
@@ -45,8 +45,7 @@ def import_tree() -> None:
 
 
 class _CpuTree:
-    """Equivalent of :class:`~pointsplat_ns.geometry.box_tree.BoxTree` for points (N, D) float64,
-    with scipy."""
+    """scipy's twin of :class:`~pointsplat_ns.geometry.box_tree.BoxTree`, points (N, D) float64."""
 
     def __init__(self, points: Tensor):
         from scipy.spatial import cKDTree
@@ -101,7 +100,7 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
         near[these, : found - 1] = indices[:, 1:].to(torch.int32)
         same[these] = (points[near[these, k - 1].long()] == points[these]).all(1)
 
-    in_threads(search, pieces(len(points), points.device, QUERIES_AT_ONCE), points.device)
+    parallel_for(search, pieces(len(points), points.device, QUERIES_AT_ONCE), points.device)
     crowd = same.nonzero()[:, 0]
     if found > k and len(crowd):
         walk = tree.order

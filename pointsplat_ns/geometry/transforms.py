@@ -39,8 +39,7 @@ def flip_camera_axes(camera_to_worlds: Tensor) -> Tensor:
 
 
 def invert_rigid(matrices: Tensor) -> Tensor:
-    """Inverses (C, 4, 4) of rigid motions (C, 3 or 4, 4): the rotation is transposed.
-    Differentiable."""
+    """Inverses (C, 4, 4) of rigid motions (C, 3 or 4, 4), by transposing R. Differentiable."""
     rotation = matrices[:, :3, :3].transpose(1, 2)
     translation = -rotation @ matrices[:, :3, 3:]
     last_row = matrices.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(matrices), 1, 4)
@@ -80,8 +79,7 @@ def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rotation_components(unit: Tensor) -> Tensor:
-    """Rotation matrices (3, 3, M) of unit quaternions (4, M), each entry contiguous; zero gives the
-    identity."""
+    """Rotation matrices (3, 3, M) of unit quaternions (4, M), by entry; zero is the identity."""
     w, x, y, z = unit
     x2, y2, z2 = 2 * unit[1:]
     xx = x * x2
@@ -207,15 +205,13 @@ def unit_cells(means: Tensor, cube: Cube | None = None) -> Tensor:
 
 
 def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
-    """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each
-    axis."""
+    """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset``."""
     grid = (cells.T + offset).clamp_(0, 1).mul_(2**20 - 1).long()  # 60 of the 63 bits in a key
     return interleave(*(spread_bits(axis) for axis in grid))
 
 
 def smallest_turn(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (3, 3) from one direction to another; not unique for opposite
-    directions."""
+    """The smallest rotation (3, 3) between two directions; not unique for opposite ones."""
     cosine = float(start @ end)
     if cosine < -1 + 1e-12:
         side = torch.linalg.cross(start, torch.eye(3, **DOUBLES)[int(start.abs().argmin())])

@@ -27,8 +27,7 @@ WEIGHTS_VARIABLE = "POINTSPLAT_LPIPS_WEIGHTS"
 
 
 class LpipsUnavailable(PointSplatError):
-    """The weights of LPIPS, or torchvision, are not available; the message gives the reason in one
-    line."""
+    """LPIPS weights or torchvision are not available; the message gives the reason."""
 
 
 class _Backbone(NamedTuple):
@@ -92,8 +91,7 @@ class Lpips(nn.Module):
         return self.requires_grad_(False)
 
     def forward(self, pred: Tensor, target: Tensor) -> Tensor:
-        """LPIPS of each image pair, in float32; arguments, result and errors as for
-        :func:`lpips`."""
+        """LPIPS of each image pair, in float32; arguments and errors as :func:`lpips`."""
         a, b = as_nchw(pred, target)
         least = _BACKBONES[self.net].minimum
         if min(a.shape[2:]) < least:
@@ -159,8 +157,7 @@ class ReportedLpips:
     """The latest reason for a missing value; None if no value is missing."""
 
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
-        """LPIPS with AlexNet, as :func:`lpips`; None, with ``reason`` set, if it cannot be
-        computed."""
+        """LPIPS with AlexNet, as :func:`lpips`; None, with ``reason`` set, if it fails."""
         try:
             return cached_lpips("alex", pred.device)(pred, target)
         except (

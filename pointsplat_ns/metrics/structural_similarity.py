@@ -31,7 +31,7 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 
 class SimilarityStruct(Struct):
-    """``Similarity`` of ``structural_similarity.cpp``, which says what its members are."""
+    """``Similarity`` of ``structural_similarity.cpp``, which documents its members."""
 
     members = {
         "image": FLOAT_POINTER,
@@ -110,8 +110,7 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _suited(image: Tensor, other: Tensor) -> bool:
-    """Whether the kernel supports images of these sizes, with a gradient for at most one of
-    them."""
+    """Whether the kernel supports these image sizes, with a gradient for at most one image."""
     return (
         image.dim() == 4
         and image.shape == other.shape

@@ -256,7 +256,7 @@ def largest_within(
         written = _as_written(scene)
         found = limit
         if limit.kind.rounded is not None:
-            psnr = few_psnr(psnr_of(scene) if psnr_of else 30.0, count / n)
+            psnr = rounding_psnr(psnr_of(scene) if psnr_of else 30.0, count / n)
             rounding = rounding_for(psnr, full.sh_degree)
             written = limit.kind.rounded(written, rounding)
             found = replace(limit, rounding=rounding)
@@ -283,13 +283,12 @@ def largest_within(
     return *found.best, len(found.tried)
 
 
-def few_psnr(psnr: float, kept: float) -> float:
-    """PSNR by which the numbers of a scene are rounded that has a PSNR, dB, with a share ``kept``
-    of the Gaussians.
+def rounding_psnr(psnr: float, share: float) -> float:
+    """PSNR that sets the rounding of a scene's numbers, dB.
 
-    The squared error of merging is taken as A (kept^-p - 1): it falls by ``SLOPE`` for each e-fold
-    of a small count, and to 0 for all Gaussians. A Gaussian more gains the more, the nearer to all
-    they are, so that rounding may cost more: at the best division of bytes, its error is a share of
-    A kept^-p, which few Gaussians have.
+    The scene has ``share`` of the Gaussians and a PSNR of ``psnr``, dB. Its squared error of merging
+    is modelled as A (share^-p - 1): it falls by ``SLOPE`` per e-fold of a small count, and to 0 for
+    all Gaussians. Near the full count, another Gaussian gains more, so rounding may cost more: at
+    the best division of bytes, its error is a share of A share^-p, the error of few Gaussians.
     """
-    return psnr + 10 * math.log10(1 - kept ** (SLOPE * math.log(10) / 10)) if kept < 1 else psnr
+    return psnr + 10 * math.log10(1 - share ** (SLOPE * math.log(10) / 10)) if share < 1 else psnr

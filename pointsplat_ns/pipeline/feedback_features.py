@@ -13,7 +13,7 @@ from torch import Tensor
 from pointsplat_ns.pipeline.optimiser import Adam, AdamSettings, Choose
 from pointsplat_ns.scene.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.system.pieces import pieces
-from pointsplat_ns.system.threads import in_threads, one_thread_each
+from pointsplat_ns.system.threads import one_thread_each, parallel_for
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Feedback(Adam):
             found[rows] = network(self.features(scene, done, steps, rows)).to(found)
 
         with one_thread_each():
-            in_threads(fill, pieces(len(scene), scene.device, 1 << 12), scene.device)
+            parallel_for(fill, pieces(len(scene), scene.device, 1 << 12), scene.device)
         return found
 
     @torch.no_grad()

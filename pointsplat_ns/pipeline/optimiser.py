@@ -34,7 +34,7 @@ from pointsplat_ns.system.kernels import (
     on_threads,
 )
 from pointsplat_ns.system.tensors import DOUBLES
-from pointsplat_ns.system.threads import in_turn, most_threads, one_thread, one_thread_each
+from pointsplat_ns.system.threads import most_threads, one_thread, one_thread_each, parallel_map
 
 
 class AdamStepStruct(Struct):
@@ -261,7 +261,7 @@ def optimised(
     while True:
         with one_thread_each():
             inside = max(1, most_threads() // together)
-            found = [*in_turn(gradients, [*islice(examples, together)], scene.device, inside)]
+            found = [*parallel_map(gradients, [*islice(examples, together)], scene.device, inside)]
         for each in found:
             with one_thread_each():
                 last = adam.stepped(last, each, choose)

@@ -44,8 +44,7 @@ class Megabytes:
 
     @property
     def bytes_of(self) -> Callable[[int, int, Traits], int] | None:
-        """File size, bytes, from count, SH degree and traits; None if it is known only after
-        writing."""
+        """File size, bytes, from count, SH degree and traits; None if only writing tells."""
         return format_to_write(self.suffix).bytes_of
 
     def __str__(self) -> str:

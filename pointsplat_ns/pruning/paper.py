@@ -79,8 +79,7 @@ def zscore(values: Tensor) -> Tensor:
 
 
 def log_volume(scene: Gaussians) -> Tensor:
-    """Natural logarithm of 4/3 pi sx sy sz, cubic scene units, (N,) float64; -Inf for a flat
-    Gaussian."""
+    """Natural logarithm of 4/3 pi sx sy sz, cubic scene units, (N,) float64; -Inf if flat."""
     return scene.scales.double().sum(dim=1) + math.log(4 / 3 * math.pi)
 
 

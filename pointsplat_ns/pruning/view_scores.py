@@ -179,8 +179,7 @@ def _second_moments(projected: Projected, colors: Tensor, view: View) -> Tensor:
 
 
 def _jacobian(outputs: Tensor, means: Tensor, scales: Tensor, ids: Tensor) -> Tensor:
-    """Derivatives of (M, F) by the means and log-scales of the same Gaussians, (M, F, 6)
-    float64."""
+    """Derivatives (M, F, 6) float64 of (M, F) by the same Gaussians' means and log-scales."""
     if not outputs.requires_grad:  # colours of SH degree 0 depend on neither
         return outputs.new_zeros(*outputs.shape, 6, dtype=torch.float64)
     rows = []

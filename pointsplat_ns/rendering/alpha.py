@@ -24,8 +24,7 @@ CLAMPED = ALPHA_MAX * (1 - 1e-6)
 """Alphas from here on count as clamped; the margin covers the rounding of ALPHA_MAX to float32."""
 
 STEP_BY_STEP = 64
-"""Largest chunk that is scanned one Gaussian at a time; longer chunks use fewer, larger
-operations."""
+"""Largest chunk scanned Gaussian by Gaussian; longer chunks use fewer, larger operations."""
 
 
 def alphas_(log2_alpha: Tensor, alpha_min: float, may_clamp: bool = True) -> Tensor:

@@ -60,7 +60,7 @@ class Blend(torch.autograd.Function):
         tape = engine.blend_region(grid, tiles, inputs, image, final, needs_grad and keep_lists)
         if needs_grad:
             ctx.save_for_backward(means2d, cov2d, det, opacities, colors, final)
-            ctx.kept = (tiles, tape) if keep_lists else None
+            ctx.lists = (tiles, tape) if keep_lists else None
             ctx.arguments = footprints, rows, absgrad, engine
         return image, final
 
@@ -72,8 +72,8 @@ class Blend(torch.autograd.Function):
         footprints, rows, absgrad, engine = ctx.arguments
         grid = footprints.grid
         inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, grid.alpha_min)
-        if ctx.kept:
-            tiles, tape = ctx.kept
+        if ctx.lists:
+            tiles, tape = ctx.lists
         else:
             tiles = footprints.tiles(*rows)
             again = torch.empty_like(grad_image), torch.empty_like(final)

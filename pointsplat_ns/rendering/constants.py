@@ -1,8 +1,7 @@
 """Thresholds of 3D Gaussian rasterization, with the values of 3DGS and gsplat."""
 
 ALPHA_MIN = 1.0 / 255.0
-"""A Gaussian with a lower alpha is not drawn on a pixel, because it cannot change an 8-bit
-image."""
+"""Minimum alpha of a drawn Gaussian on a pixel: a lower one cannot change an 8-bit image."""
 
 ALPHA_MAX = 0.999
 """Upper bound of alpha, so that 1 - alpha never vanishes and the backward pass can divide by it."""
@@ -11,8 +10,7 @@ TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished before the Gaussian that would bring its transmittance to this or less."""
 
 FRUSTUM_MARGIN = 0.3
-"""The Jacobian is evaluated at most this share of half the image size outside of the image, as in
-3DGS."""
+"""Maximum distance outside of the image for the Jacobian, in half image sizes, as in 3DGS."""
 
 COMPENSATION_MIN = 0.005
 """Lower bound of the antialiasing compensation factor."""

@@ -43,8 +43,7 @@ class Lens(NamedTuple):
     antialiased: bool
 
     def clamps(self) -> list[tuple[float, float]]:
-        """Bounds of x / z and y / z for the Jacobian, relative to the principal point (gsplat
-        #305)."""
+        """Bounds of x / z and y / z for the Jacobian, around the principal point (gsplat #305)."""
         bounds = []
         for side, focal, middle in (
             (self.width, self.fx, self.cx),
@@ -109,8 +108,7 @@ def _rotation_backward(
 
 
 def _cross(p: Tensor, q: Tensor) -> list[Tensor]:
-    """Cross product of rows (3, M). Each component uses two columns of P, so a needle's is
-    exact."""
+    """Cross product of rows (3, M): exact for needles, as components use two columns of P."""
     return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
 
 
@@ -227,22 +225,22 @@ class Project(torch.autograd.Function):
         keep &= mx.isfinite() & my.isfinite() & (points[2] > lens.near) & (points[2] < lens.far)
         keep &= (mx + half_x >= 0.5) & (mx - half_x <= lens.width - 0.5)
         keep &= (my + half_y >= 0.5) & (my - half_y <= lens.height - 0.5)
-        kept = keep.nonzero()[:, 0]
+        drawn = keep.nonzero()[:, 0]
 
-        ids = ids.index_select(0, kept)
+        ids = ids.index_select(0, drawn)
         rows = torch.stack([mx, my, points[2], xx, xy, yy, det, alphas, radii]).index_select(
-            1, kept
+            1, drawn
         )
-        directions = directions.index_select(0, kept).to(means.dtype)
-        exact_depths = exact[2].index_select(0, kept)
-        depth_keys = (exact_depths - exact_depths.amin() if len(kept) else exact_depths).to(
+        directions = directions.index_select(0, drawn).to(means.dtype)
+        exact_depths = exact[2].index_select(0, drawn)
+        depth_keys = (exact_depths - exact_depths.amin() if len(drawn) else exact_depths).to(
             means.dtype
         )
         ctx.lens = lens
         ctx.count = means.shape[0]
         if any(ctx.needs_input_grad):
             state = torch.cat([slopes, rz[None], unit, inverse_length[None], std, ratio[None]])
-            ctx.save_for_backward(ids, state.index_select(1, kept), directions, view, opacities)
+            ctx.save_for_backward(ids, state.index_select(1, drawn), directions, view, opacities)
         radii = rows[8].ceil().clamp_max_(2**30).to(torch.int32)
         ctx.mark_non_differentiable(ids, radii, depth_keys)
         cov2d = rows[3:6].T.contiguous()

@@ -32,7 +32,7 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 
 
 class CameraStruct(Struct):
-    """``Camera`` of ``camera.h``, which says what its members are."""
+    """``Camera`` of ``camera.h``, which documents its members."""
 
     members = {
         "view": ctypes.c_double * 9,
@@ -62,7 +62,7 @@ class CameraStruct(Struct):
 
 
 class SceneStruct(Struct):
-    """``Scene`` of ``camera.h``, which says what its members are."""
+    """``Scene`` of ``camera.h``, which documents its members."""
 
     members = {
         "means": FLOAT_POINTER,
@@ -75,7 +75,7 @@ class SceneStruct(Struct):
 
 
 class ProjectionStruct(Struct):
-    """``Projection`` of ``projection.cpp``, which says what its members are."""
+    """``Projection`` of ``projection.cpp``, which documents its members."""
 
     members = {
         "camera": CameraStruct,
@@ -87,7 +87,7 @@ class ProjectionStruct(Struct):
 
 
 class ProjectionGradientStruct(Struct):
-    """``ProjectionGradient`` of ``projection.cpp``, which says what its members are."""
+    """``ProjectionGradient`` of ``projection.cpp``, which documents its members."""
 
     members = {
         "camera": CameraStruct,
@@ -165,8 +165,7 @@ def camera_centre(viewmat: Tensor) -> Tensor:
 
 
 def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
-    """Whether numbers of a camera have the expected values, up to the rounding of an inverted
-    matrix."""
+    """Whether camera numbers have the expected values, up to the rounding of inversion."""
     return all(abs(value - right) <= 1e-5 for value, right in zip(values, wanted, strict=True))
 
 
@@ -288,13 +287,13 @@ def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
 
 
 def scene_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Struct:
-    """The Gaussians of kernels, from contiguous tensors."""
+    """The Gaussians as a struct for kernels, from contiguous tensors."""
     return SceneStruct(
         means=means, quats=quats, scales=scales, opacities=opacities, count=len(means)
     )
 
 
-def kept_rows(counts: Tensor) -> Tensor:
+def packed_rows(counts: Tensor) -> Tensor:
     """Rows of the visible Gaussians in the kernels' output, which are first in each range;
     ``counts`` (ranges,) int64."""
     before = torch.cumsum(counts, 0) - counts
@@ -316,15 +315,14 @@ class CompiledProject(torch.autograd.Function):
         scene = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
         count = means.shape[0]
         counts = torch.empty(-(-count // range_kernel()), **INDICES)
-        seen = torch.empty(
-            count, seen_kernel() // 4, **FLOATS
-        )  # each range's from where the range begins
+        # each range starts at its first Gaussian
+        seen = torch.empty(count, seen_kernel() // 4, **FLOATS)
         camera = camera_struct(view, centre, lens)
         task = ProjectionStruct(camera=camera, scene=scene_struct(*scene), seen=seen, counts=counts)
         on_threads(count >= SEVERAL, project_kernel, task)
 
         # fields of the struct Seen, in units of four bytes
-        parts = seen.index_select(0, kept_rows(counts)).split([2, 2, 2, 1, 3, 1, 1, 3, 1], dim=1)
+        parts = seen.index_select(0, packed_rows(counts)).split([2, 2, 2, 1, 3, 1, 1, 3, 1], dim=1)
         exact, ids, means2d, depths, cov2d, det, alphas, directions, radii = (
             part.contiguous() for part in parts
         )

@@ -116,8 +116,7 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
 
 
 def _warn_of(skipped: int, scene: Gaussians) -> None:
-    """Warn about Gaussians with invalid values, which are not drawn; once for each number of
-    them."""
+    """Warn about Gaussians with invalid values, which are not drawn; once for each number."""
     if skipped:
         text = f"{skipped} of {len(scene)} Gaussians have NaN or infinite values and are not drawn"
         warnings.warn(text, stacklevel=1)  # from one line, so that Python shows each text once

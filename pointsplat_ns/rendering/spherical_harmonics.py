@@ -25,7 +25,7 @@ from pointsplat_ns.system.tensors import full_precision
 
 
 class ColorsStruct(Struct):
-    """``Colors`` of ``colors.cpp``, which says what its members are."""
+    """``Colors`` of ``colors.cpp``, which documents its members."""
 
     members = {
         "directions": FLOAT_POINTER,
@@ -48,8 +48,7 @@ color_kernel = Function("pointsplat_color", ColorsStruct, INT64_POINTER)
 
 
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
-    """Gradient (3, M) of the unit direction, from the gradients ((degree + 1)^2, M) of the
-    basis."""
+    """Gradient (3, M) of the unit direction, from the basis' ((degree + 1)^2, M)."""
     x, y, z = unit
     gx = -C1 * grad[3]
     gy = -C1 * grad[1]
@@ -116,8 +115,7 @@ def _blocks(count: int, on_cpu: bool) -> list[slice]:
 
 
 def offset(color: Tensor) -> Tensor:
-    """Add the 1/2 of 3DGS, and turn infinities into NaN, because the lower bound of 0 would hide
-    them."""
+    """Add the 1/2 of 3DGS; infinities become NaN, because the lower bound would hide them."""
     return (color - color) + (color + 0.5)
 
 
@@ -246,8 +244,7 @@ def _call_kernels(
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, at degree 0 to
-    3."""
+    """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, degree 0 to 3."""
     return torch.stack(basis_rows(directions.movedim(-1, 0), degree), dim=-1)
 
 

@@ -46,7 +46,7 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 
 
 class PlacingStruct(Struct):
-    """``Placing`` of ``whole_pictures.cpp``, which says what its members are."""
+    """``Placing`` of ``whole_pictures.cpp``, which documents its members."""
 
     members = {
         "camera": CameraStruct,
@@ -66,7 +66,7 @@ class PlacingStruct(Struct):
 
 
 class PlacingGradientStruct(Struct):
-    """``PlacingGradient`` of ``whole_pictures.cpp``, which says what its members are."""
+    """``PlacingGradient`` of ``whole_pictures.cpp``, which documents its members."""
 
     members = {
         "placing": PlacingStruct,
@@ -107,9 +107,9 @@ class _Placed(NamedTuple):
 def _placed(
     scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, taped: bool = False
 ) -> _Placed | None:
-    """What a camera sees, with or without colours, with all that gradients need if it is ``taped``;
-    None if the pairs are more than :data:`MOST_PAIRS`, or than gradients of 192 bytes each have
-    memory for."""
+    """The Gaussians that a camera sees, with or without colours, and with the lists for gradients
+    if ``taped``; None if there are more than :data:`MOST_PAIRS` pairs, or too little memory for
+    gradients of 192 bytes per pair."""
     count = len(scene)
     tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
     coefficients = scene.features_dc.contiguous(), scene.features_rest.contiguous()
@@ -134,7 +134,7 @@ def _placed(
         ids=ids,
     )
     on_threads(count >= SEVERAL, place_kernel, task)
-    rows = projection.kept_rows(counts)
+    rows = projection.packed_rows(counts)
     ids = ids[rows]
     order = ids[tiles.by_depth(projection.depths_behind_nearest(depths[rows]))]
     most = MOST_PAIRS // 12 if taped else MOST_PAIRS

@@ -94,8 +94,7 @@ def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
 
 
 def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
-    """The scene of parameters, given with their keys in the file; includes Gaussians that cannot be
-    drawn."""
+    """The scene of parameters, given with their keys; includes Gaussians that cannot be drawn."""
     limit = path.stat().st_size
     require_memory(
         path, min(limit, sum(4 * value.numel() for _, value in values.values() if _is_dense(value)))

@@ -182,8 +182,7 @@ def distinct(names: Iterable[str]) -> list[str]:
 
 
 def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
-    """The scene for the viewer and the exporters: the first evaluation scene, or else the first
-    scene."""
+    """The scene for the viewer and the exporters: the first evaluation scene, or else the first."""
     held_out = set(eval_scenes)
     return next((name for name in names if name in held_out), names[0])
 

@@ -34,8 +34,7 @@ def offset_for(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> 
 
 
 def rounded_centre(means: NDArray[np.float64]) -> Offset:
-    """The median of finite positions (N, 3), N > 0, rounded to a power of ten within their
-    extent."""
+    """Median of finite positions (N, 3), N > 0, rounded to a power of ten within their extent."""
     centre = np.median(means, axis=0)
     extent = float(np.median(np.abs(means - centre).max(axis=1)))
     unit = 10.0 ** math.floor(math.log10(extent)) if extent > 1e-300 else 0.0

@@ -211,8 +211,7 @@ class PlyRows:
             ) from error
 
     def _shift_positions(self, warn: bool) -> None:
-        """Subtract an offset from positions that lose too much precision in float32; logged if
-        ``warn``."""
+        """Subtract an offset if float32 loses too much precision; logged if ``warn``."""
         with failure_named(self.path, "read"), self.path.open("rb") as stream:
             rows = self._rows(stream, [*range(0, self.count, max(1, self.count // SAMPLED))])
         self._shift = offset_for(_doubles(rows, COLUMNS["means"]), _doubles(rows, self._scales))
@@ -358,8 +357,7 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
 
 
 def row_table(scene: Gaussians) -> np.ndarray:
-    """The rows of a 3DGS PLY, (N, 17 + 3 K) little-endian float32, for a float32 scene on the
-    CPU."""
+    """Rows of a 3DGS PLY, (N, 17 + 3 K) little-endian float32, of a float32 scene on the CPU."""
     rest = scene.features_rest.transpose(1, 2).reshape(len(scene), 3 * scene.features_rest.shape[1])
     values = [scene.means, torch.zeros_like(scene.means), scene.features_dc, rest]
     values += [scene.opacities, scene.scales, scene.quats]
@@ -385,8 +383,7 @@ def ply_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
 
 
 def column_names(rest: int) -> list[str]:
-    """All vertex properties in file order, with ``rest`` SH coefficients beyond the constant
-    one."""
+    """Vertex properties in file order, with ``rest`` SH coefficients beyond the constant one."""
     first = [*COLUMNS["means"], *COLUMNS["normals"], *COLUMNS["features_dc"]]
     last = [*COLUMNS["opacities"], *COLUMNS["scales"], *COLUMNS["quats"]]
     return [*first, *(f"f_rest_{i}" for i in range(rest)), *last]

@@ -186,8 +186,7 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
 
 
 def scene_name(run: Run) -> str:
-    """A short scene name that is valid as a file name: the experiment's, or else the data
-    folder's."""
+    """Short scene name, valid as a file name: the experiment's, or else the data folder's."""
     name = run.experiment_name if run.experiment_name != "unnamed" else ""
     data = run.data.parent if run.data.suffix else run.data
     return file_stem(name or data.name or run.folder.name)
@@ -208,8 +207,7 @@ def _tagged(parent: Tagged, name: str, path: Path) -> Tagged:
 
 
 def _settings(config: Tagged, *without: str) -> dict[str, Any]:
-    """Fields of a configuration object, except names that begin with ``_`` and those in
-    ``without``."""
+    """Fields of a configuration object, except ``_...`` and names in ``without``."""
     return {
         key: value
         for key, value in config.fields.items()

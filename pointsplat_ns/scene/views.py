@@ -141,8 +141,7 @@ class Views:
         return (self[index] for index in range(len(self)))
 
     def relative_to(self, offset: tuple[float, float, float] | None) -> Views:
-        """The views for a scene with positions relative to an offset, scene units; computed in
-        float64."""
+        """The views of a scene with positions relative to an offset; computed in float64."""
         if offset is None:
             return self
         viewmats = self.viewmats.double()
@@ -157,8 +156,7 @@ class Views:
         return self[spread_indices(len(self), count)]
 
     def resized(self, max_side: int) -> Views:
-        """The views with the longer side of the image at most ``max_side`` pixels; never
-        enlarges."""
+        """The views with the longer image side at most ``max_side`` pixels; never enlarges."""
         factor = max_side / max(self.width, self.height)
         if factor >= 1:
             return self

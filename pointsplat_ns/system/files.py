@@ -39,8 +39,7 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 def require_file(path: Path | str, what: str) -> Path:
-    """``path`` as a Path. Raises SceneError, with ``what`` was expected, if it is not a regular
-    file."""
+    """``path`` as a Path. Raises SceneError, naming ``what``, if it is not a regular file."""
     path = Path(path)
     if not path.exists():
         raise SceneError(f"{path}: no such file; expected {what}")
@@ -107,8 +106,7 @@ def content_hash(path: Path | str) -> str:
 
 
 def one_line(error: BaseException, limit: int = 160) -> str:
-    """First line of an exception's text, at most ``limit`` characters; its type name if the text is
-    empty."""
+    """First line of an exception's text, at most ``limit`` characters; its type if empty."""
     lines = str(error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,8 +1,7 @@
 """Calls the package's C++ functions, which are compiled at installation, on several threads.
 
-A module that calls a kernel declares it: the structs that it takes as classes (:class:`Struct`),
-the function with the types of its arguments (:class:`Function`). Tests compare the declarations
-with those of the C++ files by a compiler.
+A module that calls a kernel declares its structs (:class:`Struct`) and its function with argument
+types (:class:`Function`). Tests compare the declarations with the C++ files, by a compiler.
 """
 
 from __future__ import annotations
@@ -27,8 +26,7 @@ logger = logging.getLogger("pointsplat_ns")
 
 
 class Pointer:
-    """Type of a pointer, which takes contiguous tensors on the CPU, of one dtype or of any,
-    addresses and None."""
+    """Pointer type. Accepts contiguous CPU tensors, of one dtype or of any, addresses and None."""
 
     def __init__(self, dtype: torch.dtype | None):
         self.dtype = dtype
@@ -57,7 +55,7 @@ DOUBLE_POINTER = Pointer(torch.float64)
 INT32_POINTER = Pointer(torch.int32)
 INT64_POINTER = Pointer(torch.int64)
 ANY_POINTER = Pointer(None)
-"""Of structs, in a tensor of bytes."""
+"""Points to structs in a tensor of bytes."""
 
 
 def c_fields(members: dict[str, Any]) -> list[tuple[str, Any]]:
@@ -71,47 +69,46 @@ def c_fields(members: dict[str, Any]) -> list[tuple[str, Any]]:
 class Struct(ctypes.Structure):
     """A struct of a C++ file. A subclass lists its members in ``members``, in the order of the
     file, and has ``_fields_ = c_fields(members)``; arrays are flat. :meth:`fill` sets pointers to
-    what :class:`Pointer` takes, and keeps tensors alive."""
+    the values that :class:`Pointer` accepts, and keeps references to tensors."""
 
     members: ClassVar[dict[str, Any]] = {}
     """Types of the members by name: a type of ctypes, another struct, or a :class:`Pointer`."""
 
     def __init__(self, **values: Any):
-        self.kept: dict[str, Any] = {}
+        self.references: dict[str, Any] = {}
         self.fill(**values)
 
     def fill(self, **values: Any) -> None:
-        """Set fields. Raises AttributeError if there is no such field, and TypeError if a value
-        does not fit its type."""
+        """Set fields. Raises AttributeError for unknown fields, and TypeError for wrong types."""
         unknown = values.keys() - self.members.keys()
         if unknown:
             raise AttributeError(f"{type(self).__name__} has no member {sorted(unknown)[0]}")
-        self.kept.update(values)
+        self.references.update(values)
         for name, value in values.items():
             kind = self.members[name]
             setattr(self, name, kind.address(value) if isinstance(kind, Pointer) else value)
 
     @classmethod
     def from_param(cls, value: Any) -> Any:
-        """What ctypes passes for an argument: the address of a struct of this class. Raises
-        TypeError for anything else."""
+        """Value that ctypes passes for an argument: the address of a struct of this class. Raises
+        TypeError for any other type."""
         if not isinstance(value, cls):
             raise TypeError(f"{type(value).__name__}; expected {cls.__name__}")
         return ctypes.byref(value)
 
 
 FUNCTIONS: dict[str, Function] = {}
-"""All that are declared, by name."""
+"""All declared functions by name."""
 
 
 class Function:
-    """A function of a C++ file, found in the library when it is first called.
+    """A function of a C++ file, looked up in the library at its first call.
 
     Args:
-        name: its name in the file.
-        arguments: types of its arguments: types of ctypes, :class:`Pointer`, and classes of
-            structs, which it takes by address.
-        result: type of its result; None if it has none.
+        name: name in the file.
+        arguments: argument types: ctypes types, :class:`Pointer`, and subclasses of
+            :class:`Struct`, which are passed by address.
+        result: result type; None if it returns nothing.
     """
 
     def __init__(self, name: str, *arguments: Any, result: Any = None):
@@ -154,7 +151,7 @@ class Kernels:
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
-        """The functions. Raises OSError if they were not built."""
+        """The loaded library. Raises OSError if it was not built."""
         return ctypes.CDLL(str(self._path))
 
     @functools.cached_property
@@ -194,8 +191,7 @@ class Kernels:
         return not why
 
     def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:
-        """Whether to use the kernels for these tensors: float32, on a CPU; ``wanted`` as for
-        :meth:`usable`."""
+        """Whether to use the kernels for these tensors: float32, on a CPU; see :meth:`usable`."""
         suited = all(
             tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors
         )

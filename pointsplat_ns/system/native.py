@@ -21,8 +21,8 @@ FLAGS = (
     "-fno-math-errno",
     "-fno-trapping-math",
     "-Wno-psabi",
-    # Eight numbers at once, multiplied and added in one rounding: Intel's processors since 2013,
-    # AMD's since 2015. With AVX-512 the kernels are no faster, and give the same bits.
+    # Eight numbers at a time, with fused multiply-add: Intel processors since 2013, AMD since
+    # 2015. With AVX-512 the kernels are no faster, and give the same bits.
     *(("-mavx2", "-mfma") if IS_X86 else ()),
 )
 """Compiler flags, for any machine of this architecture, because wheels are built on other machines

@@ -59,8 +59,7 @@ _outputs: ContextVar[_Outputs | None] = ContextVar("outputs", default=None)
 
 @contextmanager
 def outputs_claimed() -> Iterator[None]:
-    """Inside of this context, :func:`claim` claims names for this command. A nested context changes
-    nothing."""
+    """Inside of this context, :func:`claim` claims names for this command; no effect if nested."""
     if _outputs.get() is not None:
         yield
         return
@@ -105,8 +104,7 @@ def written(path: Path) -> None:
 
 
 def unnamed(path: Path) -> Path:
-    """Mark ``path`` as automatically named in this command, and return it. A symbolic link there is
-    untrusted."""
+    """Mark ``path`` as automatically named, and return it. A symbolic link there is untrusted."""
     outputs = _outputs.get()
     if outputs is not None:
         outputs.unnamed.add(os.path.abspath(path))

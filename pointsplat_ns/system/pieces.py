@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pointsplat_ns.system.threads import in_threads
+from pointsplat_ns.system.threads import parallel_for
 
 CHUNK = 1 << 16
 """Number of rows per piece on a CPU."""
@@ -36,5 +36,5 @@ def in_pieces(
     def fill(these: slice) -> None:
         result[these] = function(members[these]).to(dtype)
 
-    in_threads(fill, pieces(len(members), members.device), members.device)
+    parallel_for(fill, pieces(len(members), members.device), members.device)
     return result

@@ -21,8 +21,7 @@ from pointsplat_ns.errors import PointSplatError
 
 
 def torchrun_rank() -> tuple[int, int]:
-    """Rank of this process and number of processes that ``torchrun`` started; 0 and 1 without
-    it."""
+    """Rank of this process and number of processes of ``torchrun``; 0 and 1 without it."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return 0, 1
     return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
@@ -56,8 +55,7 @@ def rank() -> int:
 
 
 def any_rank(flag: bool, device: torch.device | str) -> bool:
-    """Whether ``flag`` is set in any process. All processes must call this, each with its own
-    device."""
+    """Whether ``flag`` is set in any process. All must call this, with their own device."""
     if world_size() == 1:
         return flag
     count = torch.tensor([float(flag)], device=device, dtype=torch.float32)

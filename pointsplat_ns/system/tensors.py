@@ -78,8 +78,7 @@ def full_precision(function: Function) -> Function:
 
 
 def _copied(value: Any) -> Any:
-    """A copy of an inference-mode tensor, or of a dataclass with such tensors; anything else
-    unchanged."""
+    """A copy of an inference-mode tensor, or a dataclass with some; anything else unchanged."""
     if isinstance(value, torch.Tensor):
         return value.clone() if value.is_inference() else value
     fields = (

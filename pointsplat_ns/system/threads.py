@@ -3,8 +3,8 @@
 When torch shares an operation between threads, they busy-wait for one another at its end. Small
 operations end often: two threads take as long as one, and ten times as long if another program
 occupies one of the cores. Here torch uses one thread (:func:`one_thread_each`). Pieces of work
-(:func:`in_turn`) and compiled kernels (:func:`pointsplat_ns.system.kernels.on_threads`) use all
-threads, which sleep while they wait.
+(:func:`parallel_map`) and compiled kernels (:func:`pointsplat_ns.system.kernels.on_threads`) use
+all threads, which sleep while they wait.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _pool(process: int, name: str, count: int, inside: int) -> ThreadPoolExecuto
     return ThreadPoolExecutor(count, f"pointsplat-{name}", torch.set_num_threads, (inside,))
 
 
-def in_turn(
+def parallel_map(
     function: Callable[[Item], Result], items: Sequence[Item], device: torch.device, inside: int = 1
 ) -> Iterator[Result]:
     """Map a function over items, and yield the results in order.
@@ -130,11 +130,11 @@ def in_turn(
         wait(futures)
 
 
-def in_threads(
+def parallel_for(
     function: Callable[[Item], object], items: Sequence[Item], device: torch.device
 ) -> None:
-    """Call a function for each item, as :func:`in_turn` does."""
-    for _ in in_turn(function, items, device):
+    """Call a function for each item, as :func:`parallel_map` does."""
+    for _ in parallel_map(function, items, device):
         pass
 
 

@@ -103,8 +103,7 @@ def _end_with(ends: connection.Connection) -> None:
 _starting = threading.Lock()
 
 SAFE_PATH_VARIABLE = "PYTHONSAFEPATH"
-"""Environment variable by which Python, from 3.11 on, does not put the current folder on its
-path."""
+"""Environment variable that keeps the current folder off the path, from Python 3.11 on."""
 
 HAS_SAFE_PATH = sys.version_info >= (3, 11)
 
@@ -116,9 +115,9 @@ def _started_safely(jobs: int) -> Iterator[None]:
     else their share of the cores.
 
     multiprocessing starts them and its resource tracker with ``python -c``, which puts the current
-    folder first on the path: what lies beside the scenes would be imported in place of Python's own
-    modules. Ctrl-C would show a traceback of each process that is still importing: they inherit
-    that it is blocked.
+    folder first on the path: files beside the scenes would be imported in place of Python's own
+    modules. Ctrl-C would print a traceback of each process that is still importing, so processes
+    inherit a blocked signal.
 
     Raises:
         PointSplatError: with Python 3.10, which has no option against it, if the current folder has
@@ -137,7 +136,7 @@ def _started_safely(jobs: int) -> Iterator[None]:
 
 @contextmanager
 def _environment(name: str, value: str) -> Iterator[None]:
-    """Set an environment variable while the context is open."""
+    """Set an environment variable inside of the context."""
     before = os.environ.get(name)
     os.environ[name] = value
     try:

@@ -27,8 +27,7 @@ class Opening:
     """The first is the opening view."""
     up: Up
     whole: bool
-    """Whether the opening view shows the whole scene from outside: an object to orbit, not a
-    room."""
+    """Whether the opening view shows the whole scene from outside: an object, not a room."""
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ from torch import Tensor
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.view_sampling.content import UNITS
-from pointsplat_ns.view_sampling.settings import looking
+from pointsplat_ns.view_sampling.settings import current_settings
 
 
 def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Tensor:
@@ -55,7 +55,7 @@ def views_of(viewmats: Tensor, width: int, height: int, diagonal: float) -> View
         diagonal: of the content, in the unit of ``viewmats``; the near plane is at a thousandth of
             it.
     """
-    focal = 0.5 * max(width, height) / math.tan(math.radians(looking().field_of_view) / 2)
+    focal = 0.5 * max(width, height) / math.tan(math.radians(current_settings().field_of_view) / 2)
     K = viewmats.new_tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     Ks = K.repeat(len(viewmats), 1, 1)
     return Views(viewmats, Ks, width, height, torch.zeros(3, **FLOATS), near_plane=1e-3 * diagonal)
@@ -88,7 +88,7 @@ def whole_views(
     sides = math.cos(lift) * level_directions(up, turns.to(up)) + math.sin(lift) * up
     viewmats = look_at(sides, torch.zeros_like(sides), up)
     x, y, z = (viewmats[:, :3, :3] @ (points - middle).T).unbind(1)  # [n, M]
-    reach = math.tan(math.radians(looking().field_of_view) / 2) / max(width, height)
+    reach = math.tan(math.radians(current_settings().field_of_view) / 2) / max(width, height)
     # maximum shares of the image's width and height that the subject fills
     across = 0.92
     along = 0.88

@@ -34,7 +34,7 @@ from pointsplat_ns.rendering.comparison.sizes import RESOLUTION
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.tensors import DOUBLES
-from pointsplat_ns.system.threads import in_turn
+from pointsplat_ns.system.threads import parallel_map
 from pointsplat_ns.view_sampling.content import (
     UNITS,
     content_size,
@@ -44,7 +44,7 @@ from pointsplat_ns.view_sampling.content import (
     thinning,
 )
 from pointsplat_ns.view_sampling.poses import level_directions, look_at, views_of
-from pointsplat_ns.view_sampling.settings import looking
+from pointsplat_ns.view_sampling.settings import current_settings
 from pointsplat_ns.view_sampling.traces import PhotoTraces, log_widths, means_around
 from pointsplat_ns.view_sampling.upright import Surface, Up, known_up, upright
 
@@ -127,9 +127,9 @@ class Sampler:
                 f"cannot sample views of {resolution[0]} x {resolution[1]} pixels; expected at "
                 "least 1 x 1"
             )
-        # many small operations
-        self.scene = thinned(scene.detach(), looking().sampled_count).to("cpu")
-        self._step = stands_for * thinning(len(scene), looking().sampled_count)
+        # on the CPU, because the operations are many and small
+        self.scene = thinned(scene.detach(), current_settings().sampled_count).to("cpu")
+        self._step = stands_for * thinning(len(scene), current_settings().sampled_count)
         self.resolution = resolution
         self._up = known_up(up, scene)
 
@@ -171,20 +171,22 @@ class Sampler:
     @cached_property
     def few(self) -> Gaussians:
         """A selection of Gaussians, enlarged to cover as much as all, with neighbours together."""
-        few = thinned(self._in_units, looking().candidate_gaussians)
+        few = thinned(self._in_units, current_settings().candidate_gaussians)
         return few[curve_keys(unit_cells(few.means)).argsort(stable=True)]
 
     @cached_property
     def _log_widths(self) -> Tensor:
         """Logarithms (n,) of the widths of :attr:`few` before enlarging, float64."""
-        step = self._step * thinning(len(self._in_units), looking().candidate_gaussians)
+        step = self._step * thinning(len(self._in_units), current_settings().candidate_gaussians)
         return log_widths(self.few.scales) - 0.5 * math.log(step)
 
     @cached_property
     def _targets(self) -> Tensor:
         """Indices (t,) of the Gaussians in :attr:`few` that are opaque enough as targets."""
         alphas = self.few.alphas
-        return (alphas > min(looking().min_opacity, 0.5 * float(alphas.max()))).nonzero()[:, 0]
+        return (alphas > min(current_settings().min_opacity, 0.5 * float(alphas.max()))).nonzero()[
+            :, 0
+        ]
 
     @cached_property
     def _floor(self) -> float:
@@ -205,7 +207,8 @@ class Sampler:
             raise DataError(f"cannot sample {count} views; expected at least 1")
         generator = torch.Generator().manual_seed(seed)
         drawn = self._drawn(
-            max(looking().min_candidates, looking().candidates_per_view * count), generator
+            max(current_settings().min_candidates, current_settings().candidates_per_view * count),
+            generator,
         )
         candidates = views_of(drawn, *self.resolution, UNITS)
         likelihoods, shown = self.judged(candidates)
@@ -221,7 +224,9 @@ class Sampler:
         mask (V, n) of the Gaussians :attr:`few` that each view shows."""
         viewmats = views.viewmats.double()
         eyes = invert_rigid(viewmats)[:, :3, 3]
-        small = replace(views.resized(looking().candidate_side), rasterize_mode="antialiased")
+        small = replace(
+            views.resized(current_settings().candidate_side), rasterize_mode="antialiased"
+        )
         widths = self._log_widths.exp().float()
 
         def look(index: int) -> tuple[float, Tensor]:
@@ -236,7 +241,9 @@ class Sampler:
             empty = max(0.0, 1 - covered / (small.width * small.height))
             return math.log(share) - math.log(empty + 0.01) - 2 * math.log(blur), shown
 
-        likelihoods, shown = zip(*in_turn(look, range(len(small)), self.few.device), strict=True)
+        likelihoods, shown = zip(
+            *parallel_map(look, range(len(small)), self.few.device), strict=True
+        )
         traces = self._traces
         evidence = (
             traces.evidence(eyes).double() if traces.has_sh else torch.zeros(len(eyes), **DOUBLES)
@@ -253,7 +260,7 @@ class Sampler:
         coverage = torch.zeros_like(shown[0])
         taken: list[int] = []
         for _ in range(min(count, len(likely))):
-            gains = likely * (shown @ (1 / (looking().half_gain_coverage + coverage)))
+            gains = likely * (shown @ (1 / (current_settings().half_gain_coverage + coverage)))
             gains[taken] = -1.0
             taken.append(int(gains.argmax()))
             coverage += shown[taken[-1]]
@@ -274,7 +281,7 @@ class Sampler:
         up = self.up.direction
         aim = self._some_targets(count, generator)
         angle, turn, pitch = torch.rand(3, count, generator=generator, **DOUBLES)
-        small, large = looking().apparent_sizes
+        small, large = current_settings().apparent_sizes
         distance = means_around(self._log_widths, 9)[aim].exp() / (small * (large / small) ** angle)
         distance = torch.where(distance < UNITS, distance, UNITS * angle).clamp_min(0.01 * UNITS)
         pitch = math.pi * (pitch - 0.5)
@@ -288,15 +295,14 @@ class Sampler:
         return look_at(target - distance[:, None] * ahead, target, up)
 
     def _from_places(self, count: int, generator: torch.Generator) -> Tensor:
-        """Cameras (count, 4, 4) near photo places, drawn by their shares, each looking at a
-        Gaussian."""
+        """Cameras (count, 4, 4) that look at Gaussians from near photo places, drawn by share."""
         up = self.up.direction
         traces = self._traces
         drawn = torch.multinomial(
             traces.shares.float(), count, replacement=True, generator=generator
         )
         offsets = torch.randn(count, 3, generator=generator, **DOUBLES)
-        eyes = traces.places[drawn] + looking().photo_place_deviation * offsets
+        eyes = traces.places[drawn] + current_settings().photo_place_deviation * offsets
         eyes = eyes + (self._floor - eyes @ up).clamp_min(0)[:, None] * up
         return look_at(eyes, self.few.means[self._some_targets(count, generator)].double(), up)
 

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class LookingSettings:
+class ViewSamplingSettings:
     """Settings of :mod:`pointsplat_ns.view_sampling`."""
 
     field_of_view: float = 70.0
-    """Field of view across the longer side of a sampled view, degrees: that of a phone's main
-    camera."""
+    """Field of view across a sampled view's longer side, degrees: a phone's main camera."""
 
     # Traces of photos (traces.py)
 
@@ -103,19 +102,21 @@ class LookingSettings:
     """Standard deviation of candidates from photo places along each axis, units."""
 
 
-SHIPPED = LookingSettings()
+DEFAULT_SETTINGS = ViewSamplingSettings()
 """The default settings."""
 
-_in_use: ContextVar[LookingSettings] = ContextVar("looking", default=SHIPPED)
+_in_use: ContextVar[ViewSamplingSettings] = ContextVar(
+    "view_sampling_settings", default=DEFAULT_SETTINGS
+)
 
 
-def looking() -> LookingSettings:
-    """The settings in use: :data:`SHIPPED`, or those of the innermost :func:`use_settings`."""
+def current_settings() -> ViewSamplingSettings:
+    """The settings of the innermost :func:`use_settings`; by default :data:`DEFAULT_SETTINGS`."""
     return _in_use.get()
 
 
 @contextmanager
-def use_settings(settings: LookingSettings) -> Iterator[None]:
+def use_settings(settings: ViewSamplingSettings) -> Iterator[None]:
     """Use other settings inside of the context, for measurements and tests. Threads started
     elsewhere and other processes are not affected."""
     token = _in_use.set(settings)

@@ -24,11 +24,10 @@ from pointsplat_ns.rendering.spherical_harmonics import sh_basis
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.pieces import in_pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
-from pointsplat_ns.view_sampling.settings import looking
+from pointsplat_ns.view_sampling.settings import current_settings
 
 MIN_SH = 1e-4
-"""Length of an SH coefficient vector, root of the sum of squares, up to which it counts as
-untrained."""
+"""Length of an SH coefficient vector, root of the sum of squares, that counts as untrained."""
 
 
 def trace_factors(scene: Gaussians, members: Tensor) -> Tensor:
@@ -57,7 +56,8 @@ def traces_around(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
     energies = in_pieces(lambda rows: _energy(scene.features_rest[rows].double()), members)
     flatnesses = in_pieces(lambda rows: _flatness(scene.scales[rows].double()), members)
     energy, flatness = (
-        means_around(values, looking().trace_neighbourhood) for values in (energies, flatnesses)
+        means_around(values, current_settings().trace_neighbourhood)
+        for values in (energies, flatnesses)
     )
     return energy, flatness
 
@@ -66,20 +66,19 @@ def factors_of(energy: Tensor, flatness: Tensor) -> Tensor:
     """The mean energy (n,) and the exponential of the mean flatness (n,), each to a power, relative
     to the median, (n,) float32; 1 for all if all are equal."""
     logs = (
-        looking().energy_exponent * (energy + MIN_SH**2).log()
-        + looking().flatness_exponent * flatness
+        current_settings().energy_exponent * (energy + MIN_SH**2).log()
+        + current_settings().flatness_exponent * flatness
     )
     return (
         (logs - logs.median())
-        .clamp(-looking().max_log_factor, looking().max_log_factor)
+        .clamp(-current_settings().max_log_factor, current_settings().max_log_factor)
         .exp()
         .float()
     )
 
 
 def _energy(sh: Tensor) -> Tensor:
-    """Sums of squares (n,) of SH coefficients (n, K, 3), clamped at 1,000; a colour of 1 is
-    white."""
+    """Sums of squares (n,) of SH coefficients (n, K, 3), clamped at 1,000; white is 1."""
     return sh.clamp(-1e3, 1e3).square().sum((1, 2))
 
 
@@ -113,11 +112,11 @@ class PhotoTraces:
 
     def __init__(self, scene: Gaussians):
         generator = torch.Generator().manual_seed(0)
-        count = looking().evidence_count
-        # some are faint
+        count = current_settings().evidence_count
+        # more than needed, because some are faint
         some = scene[torch.randperm(len(scene), generator=generator, device="cpu")[: 8 * count]]
         sh = unit_sh(some.features_rest)
-        opaque = some.usable() & (some.alphas > looking().min_opacity)
+        opaque = some.usable() & (some.alphas > current_settings().min_opacity)
         with_sh = opaque & (sh != 0).any(2).any(1)
         self.has_sh = bool(with_sh.any())
         """Whether SH are compared, instead of sizes."""
@@ -135,10 +134,14 @@ class PhotoTraces:
         self.places = 0.5 * (low + high) + 1.5 * (high - low) * offsets
         found = self.evidence(self.places)
         best = float(found.max())
-        shares = (found.clamp_min(0) / max(best, 1e-9)) ** looking().photo_share_exponent + 1e-12
+        shares = (
+            found.clamp_min(0) / max(best, 1e-9)
+        ) ** current_settings().photo_share_exponent + 1e-12
         self.shares = shares / shares.sum()
         self.sure = best >= (
-            looking().min_sh_evidence if self.has_sh else looking().min_size_evidence
+            current_settings().min_sh_evidence
+            if self.has_sh
+            else current_settings().min_size_evidence
         )
 
     def evidence(self, places: Tensor) -> Tensor:

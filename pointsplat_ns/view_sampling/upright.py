@@ -22,7 +22,7 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.view_sampling.content import UNITS
 from pointsplat_ns.view_sampling.poses import around, level_directions, whole_views
-from pointsplat_ns.view_sampling.settings import looking
+from pointsplat_ns.view_sampling.settings import current_settings
 
 CONTENT_RADIUS = 6.0
 """Distance from the content's centre within which points belong to it, units."""
@@ -66,8 +66,7 @@ def up_named(text: str | None) -> Up | None:
 
 
 def known_up(named: Up | None, scene: Gaussians) -> Up | None:
-    """The up direction without an estimate: the named one, or else the one declared by the scene's
-    file."""
+    """The up direction without an estimate: named, or else declared by the scene's file."""
     return named or up_named(scene.up)
 
 
@@ -87,7 +86,7 @@ class Surface:
         generator = torch.Generator().manual_seed(0)
         alphas = scene.alphas.double()
         count = 12_288
-        clear = scene[alphas >= min(looking().min_opacity, float(alphas.max()))]
+        clear = scene[alphas >= min(current_settings().min_opacity, float(alphas.max()))]
         logs = 0.5 * (
             F.logsigmoid(clear.opacities[:, 0].double())
             + clear.scales.double().topk(2).values.sum(1)
@@ -122,7 +121,7 @@ def upright(few: Gaussians, surface: Surface, traced: bool) -> Up:
         return max(int((pixels_of(few, view) > 0.1).sum()) for view in views)
 
     from_above = math.log((seen_from(axis) + 1) / (seen_from(-axis) + 1))
-    sure = abs(from_above) >= looking().min_seen_from_above
+    sure = abs(from_above) >= current_settings().min_seen_from_above
     y = float(axis[1])
     z = float(axis[2])
     usual = z if abs(z) > abs(y) else -y
@@ -174,7 +173,7 @@ def upright_axis(surface: Surface, traced: bool = False) -> Tensor:
     scores = uprightness(axes)
     world = torch.eye(3, **DOUBLES)
     of_world = uprightness(world) * (
-        1.1 if traced else world.new_tensor(looking().usual_axis_factors)
+        1.1 if traced else world.new_tensor(current_settings().usual_axis_factors)
     )
     return (
         world[of_world.argmax()] if bool(of_world.max() >= scores.max()) else axes[scores.argmax()]

@@ -32,7 +32,7 @@ from pointsplat_ns.rendering import render
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.view_sampling.sampler import sample_views
-from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS, use_settings
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -103,7 +103,7 @@ def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
     """In a room that the network was not trained on, and in views that no step has seen."""
     monkeypatch.setitem(STEPS, "quick", 6)
     room = example_room()[::2]
-    with use_settings(SHIPPED):
+    with use_settings(DEFAULT_SETTINGS):
         pruned = prune(room, 0.1, "merge")
         reference = DenseReference(room, sample_views(room, 4, 160, 120, seed=99))
         source = ViewProvider(room, given=sample_views(room, 20, 160, 120, seed=98))

@@ -10,9 +10,9 @@ import pytest
 
 from pointsplat_ns.pipeline import view_provider
 from pointsplat_ns.pipeline.repair_budget import STEPS
-from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS, use_settings
 
-QUICK = replace(SHIPPED, candidates_per_view=2, min_candidates=12, evidence_count=400)
+QUICK = replace(DEFAULT_SETTINGS, candidates_per_view=2, min_candidates=12, evidence_count=400)
 """Views sampled in a sixth of the time, a little worse."""
 
 RESOLUTION = (64, 48)

@@ -11,10 +11,10 @@ from pointsplat_ns.system import threads as threads_module
 from pointsplat_ns.system.cores import OtherPrograms, cores
 from pointsplat_ns.system.threads import (
     fixed_threads,
-    in_threads,
-    in_turn,
     most_threads,
     one_thread_each,
+    parallel_for,
+    parallel_map,
 )
 
 CPU = torch.device("cpu")
@@ -50,7 +50,7 @@ def test_torch_has_one_thread_and_pieces_of_work_all_until_the_context_ends():
                 assert (torch.get_num_threads(), most_threads()) == (1, 3)
             assert (torch.get_num_threads(), most_threads()) == (1, 3)
             meet = threading.Barrier(3)  # passed only if so many are there at once
-            in_threads(lambda item: meet.wait(30), range(3), CPU)
+            parallel_for(lambda item: meet.wait(30), range(3), CPU)
             raise KeyError
         assert (torch.get_num_threads(), most_threads()) == (3, 3)
     assert torch.get_num_threads() == before
@@ -64,10 +64,12 @@ def test_results_come_in_order_from_threads_of_the_callers_mode(inside):
 
     for grad in (True, False):
         with fixed_threads(2), torch.set_grad_enabled(grad):
-            assert [*in_turn(look, range(5), CPU, inside)] == [
+            assert [*parallel_map(look, range(5), CPU, inside)] == [
                 (item, inside, inside, grad) for item in range(5)
             ]
-            assert [*in_turn(look, [7], CPU)] == [(7, 2, 2, grad)], "one piece of work is done here"
+            assert [*parallel_map(look, [7], CPU)] == [(7, 2, 2, grad)], (
+                "one piece of work is done here"
+            )
 
 
 @pytest.mark.parametrize("error", [KeyError, KeyboardInterrupt])
@@ -84,7 +86,7 @@ def test_nothing_runs_any_more_after_an_error(error):
         ended.append(item)
 
     with fixed_threads(2), pytest.raises(error):
-        in_threads(work, range(50), CPU)
+        parallel_for(work, range(50), CPU)
     count = len(ended)
     time.sleep(0.3)
     assert len(ended) == count < 49
@@ -94,7 +96,7 @@ def test_threads_are_started_once():
     found = set()
     with fixed_threads(2):
         for _ in range(20):
-            in_threads(lambda item: found.add(threading.get_ident()), range(4), CPU)
+            parallel_for(lambda item: found.add(threading.get_ident()), range(4), CPU)
     assert len(found) <= 2 and threads_module._pool.cache_info().hits >= 19
 
 

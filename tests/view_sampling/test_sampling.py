@@ -21,7 +21,7 @@ from pointsplat_ns.view_sampling.content import (
 )
 from pointsplat_ns.view_sampling.poses import look_at, views_of
 from pointsplat_ns.view_sampling.sampler import Sampler, sample_views
-from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS, use_settings
 from pointsplat_ns.view_sampling.traces import PhotoTraces
 from pointsplat_ns.view_sampling.upright import Up
 
@@ -155,7 +155,7 @@ def test_views_do_not_depend_on_the_unit_of_length(make, factor):
 def test_views_of_a_large_scene_are_looked_for_in_a_part_of_it():
     scene = box_room(0, 3000)
     whole = Sampler(scene).content
-    with use_settings(replace(SHIPPED, sampled_count=600)):
+    with use_settings(replace(DEFAULT_SETTINGS, sampled_count=600)):
         few = Sampler(scene, (64, 48))
         given = Sampler(enlarged(scene[::5], 5), (64, 48), stands_for=5)
         assert len(few.scene) == 600 and len(few.views(3)) == 3
@@ -187,7 +187,7 @@ def test_the_likelihood_is_that_of_its_formula():
     sampler = sampler_of(wall())
     views = seen_from(2.0, 3.0)
     likelihoods, shown = sampler.judged(views)
-    small = replace(views.resized(SHIPPED.candidate_side), rasterize_mode="antialiased")
+    small = replace(views.resized(DEFAULT_SETTINGS.candidate_side), rasterize_mode="antialiased")
     width = 0.06 * UNITS / sampler.content[1]
     for row, view in enumerate(small):
         pixels = pixels_of(sampler.few, view).double()

@@ -11,7 +11,7 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.pipeline.view_provider import Origin, ViewOrigin, ViewProvider
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.view_sampling.sampler import sample_views
-from pointsplat_ns.view_sampling.settings import SHIPPED
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS
 from pointsplat_ns.view_sampling.traces import PhotoTraces, correlation, trace_factors
 
 
@@ -119,7 +119,7 @@ def test_extremes_stay_within_bounds(dtype):
             scene.replace(features_rest=rest, scales=scales), torch.arange(2000)
         )
         assert bool(factors.isfinite().all())
-        assert float(factors.log().abs().max()) <= SHIPPED.max_log_factor + 1e-5
+        assert float(factors.log().abs().max()) <= DEFAULT_SETTINGS.max_log_factor + 1e-5
 
 
 def test_views_are_sampled_where_photos_were_taken():

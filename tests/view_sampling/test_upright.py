@@ -16,7 +16,7 @@ from pointsplat_ns.view_sampling.content import thinned
 from pointsplat_ns.view_sampling.opening_views import opening_views
 from pointsplat_ns.view_sampling.poses import look_at, views_of
 from pointsplat_ns.view_sampling.sampler import Sampler
-from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS, use_settings
 from pointsplat_ns.view_sampling.upright import Up, upright_axis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -107,7 +107,7 @@ def test_up_is_the_side_from_which_more_is_seen(axis):
     scene = turned(corner(), turn)
     assert Sampler(scene).up.direction.tolist() == list(map(float, axis))
     if axis == (0, 1, 0):
-        with use_settings(replace(SHIPPED, min_seen_from_above=math.inf)):
+        with use_settings(replace(DEFAULT_SETTINGS, min_seen_from_above=math.inf)):
             assert Sampler(scene).up.direction.tolist() == [0.0, -1.0, 0.0]
 
 

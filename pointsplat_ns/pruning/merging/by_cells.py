@@ -45,7 +45,7 @@ from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.system.workers import Workers
 from pointsplat_ns.view_sampling.content import content_size, enlarged, thinning
 from pointsplat_ns.view_sampling.sampler import Sampler
-from pointsplat_ns.view_sampling.settings import looking
+from pointsplat_ns.view_sampling.settings import current_settings
 from pointsplat_ns.view_sampling.traces import factors_of, traces_around
 
 
@@ -97,7 +97,7 @@ def merge_file(
     def look() -> dict[str, Tensor]:
         report = functools.partial(progress, "sampling views")
         report(0.0)
-        step = thinning(rows.count, looking().sampled_count)
+        step = thinning(rows.count, current_settings().sampled_count)
         some = enlarged(rows.pick(range(0, rows.count, step)), step)  # cover as much as all
         with one_thread_each():
             seen = views_to_weigh(

@@ -31,7 +31,7 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 
 class ShapesStruct(Struct):
-    """``Shapes`` of ``covariance.cpp``, which says what its members are."""
+    """``Shapes`` of ``covariance.cpp``, which documents its members."""
 
     members = {
         "log_scales": FLOAT_POINTER,
@@ -51,8 +51,7 @@ MIN_DIVISOR = 1e-300
 
 
 def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
-    """Covariances (N, 6) of Gaussians with log-scales (N, 3), +-Inf allowed, and quaternions (N,
-    4), float64."""
+    """Covariances (N, 6), float64, of log-scales (N, 3), +-Inf allowed, and quaternions (N, 4)."""
     # products of four standard deviations and their squares fit into float64
     logs = log_scales.clamp(-40.0, 40.0)
     # an axis is at least exp(-11.5), 1e-5, of the longest, which float64 distinguishes from zero
@@ -62,8 +61,7 @@ def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
 
 
 def covariances_of(scene: Gaussians, rows: Tensor, compiled: bool | None = None) -> Tensor:
-    """:func:`covariances` (m, 6) of the Gaussians ``rows`` (m,) of a scene; ``compiled`` False uses
-    torch."""
+    """:func:`covariances` (m, 6) of a scene's ``rows`` (m,); ``compiled`` False uses torch."""
     if not KERNELS.usable_for(compiled, scene.scales, scene.quats):
         return in_pieces(
             lambda some: covariances(scene.scales[some].double(), scene.quats[some].double()),
@@ -127,8 +125,7 @@ def eigen(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def inverses_and_log_determinants(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses (N, 3, 3) and logarithms of determinants (N,) of positive definite matrices (N, 3,
-    3) float64."""
+    """Inverses (N, 3, 3) and log-determinants (N,) of positive definite (N, 3, 3) float64."""
     if matrices.device.type == "cpu":
         return torch.linalg.inv(matrices), torch.logdet(matrices)
     values, vectors = eigen(matrices)
@@ -206,8 +203,7 @@ def plane_axes(normal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def projected(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Covariances (N, 3) of the projections onto the planes of unit vectors ``u`` and ``v``
-    (N, 3)."""
+    """Covariances (N, 3) of projections onto planes of unit vectors ``u`` and ``v`` (N, 3)."""
     return torch.stack([bilinear(six, u, u), bilinear(six, u, v), bilinear(six, v, v)], dim=1)
 
 

@@ -21,7 +21,7 @@ from pointsplat_ns.rendering.constants import ALPHA_MAX
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import add_rows, numbers
-from pointsplat_ns.system.threads import in_threads, in_turn
+from pointsplat_ns.system.threads import parallel_for, parallel_map
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def _mean_sh(
             shared = own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1))
             return group[rows], shared, group[rows][of_single], own[of_single]
 
-        for groups, shared, singles, own in in_turn(
+        for groups, shared, singles, own in parallel_map(
             part, pieces(len(group), group.device), group.device
         ):
             add_rows(mean, groups, shared)
@@ -148,7 +148,7 @@ def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         scales[rows] = 0.5 * variances.log()
         quats[rows] = quaternions_of(axes).to(dtype)
 
-    in_threads(fill, pieces(len(cov), cov.device), cov.device)
+    parallel_for(fill, pieces(len(cov), cov.device), cov.device)
     return scales, quats
 
 

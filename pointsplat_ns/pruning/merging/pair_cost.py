@@ -62,11 +62,11 @@ from pointsplat_ns.system.kernels import (
 )
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES, numbers
-from pointsplat_ns.system.threads import in_threads
+from pointsplat_ns.system.threads import parallel_for
 
 
 class PlanesStruct(Struct):
-    """``Planes`` of ``pair_cost.cpp``, which says what its members are."""
+    """``Planes`` of ``pair_cost.cpp``, which documents its members."""
 
     members = {
         "axes": ctypes.c_double * 78,
@@ -77,7 +77,7 @@ class PlanesStruct(Struct):
 
 
 class CostsStruct(Struct):
-    """``Costs`` of ``pair_cost.cpp``, which says what its members are."""
+    """``Costs`` of ``pair_cost.cpp``, which documents its members."""
 
     members = {
         "planes": PlanesStruct,
@@ -177,7 +177,7 @@ def pair_costs(
         )
         costs[rows] = total * state.weights[rows, None]
 
-    in_threads(fill, pieces(len(state), device, 1 << 14), device)  # 50 MB at a time
+    parallel_for(fill, pieces(len(state), device, 1 << 14), device)  # 50 MB at a time
     return costs
 
 
@@ -270,8 +270,7 @@ def costs_in_plane(
 
 
 def _within_bounds(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Means (m, 3) and covariances (m, 6) of rows (m,), clamped to 1000 sizes of the content,
-    float64."""
+    """Means (m, 3) and covariances (m, 6) of rows, float64, clamped to 1000 content sizes."""
     means = state.means[rows].double().clamp_(-1e3, 1e3)
     cov = state.cov[rows].double()
     total = cov[:, 0] + cov[:, 3] + cov[:, 5]

@@ -38,7 +38,7 @@ from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import numbers
-from pointsplat_ns.system.threads import in_threads, in_turn
+from pointsplat_ns.system.threads import parallel_for, parallel_map
 
 NEVER = torch.iinfo(torch.int64).max
 """Key of an invalid pair."""
@@ -79,10 +79,12 @@ def cheapest_pairs(
         own = rows[left], others.index_select(1, left), keys.index_select(1, left)
         blocks[number] = *own, least[left], partner[left].long()
 
-    blocks = [*in_turn(lambda here: _pairs(near, costs, here), pieces(n, device, 1 << 14), device)]
+    blocks = [
+        *parallel_map(lambda here: _pairs(near, costs, here), pieces(n, device, 1 << 14), device)
+    ]
     found: list[tuple[Tensor, ...]] = [(numbers(0, device),) * 3]
     for _ in range(passes):
-        in_threads(free, range(len(blocks)), device)
+        parallel_for(free, range(len(blocks)), device)
         best = torch.full_like(taken, NEVER, dtype=torch.int64)
         for rows, others, keys, least, _ in blocks:
             best[rows] = torch.minimum(best[rows], least)
@@ -151,7 +153,9 @@ def replace_pairs(
     place[second] = place[first]
     rows = stays.nonzero()[:, 0]
     after = State(
-        *in_turn(lambda values: values.index_select(0, rows), [*vars(state).values()], rows.device)
+        *parallel_map(
+            lambda values: values.index_select(0, rows), [*vars(state).values()], rows.device
+        )
     )
     shares = torch.ones_like(state.weights)
 
@@ -189,7 +193,7 @@ def replace_pairs(
         shares[j] = 1 - share
 
     # fits into a cache
-    in_threads(replace, pieces(len(first), first.device, 1 << 13), first.device)
+    parallel_for(replace, pieces(len(first), first.device, 1 << 13), first.device)
     return after, Round(place.int(), shares)
 
 

@@ -53,11 +53,11 @@ from pointsplat_ns.system.kernels import (
 )
 from pointsplat_ns.system.pieces import in_pieces, pieces
 from pointsplat_ns.system.tensors import DOUBLES, add_rows, numbers
-from pointsplat_ns.system.threads import in_threads, in_turn
+from pointsplat_ns.system.threads import parallel_for, parallel_map
 
 
 class ChoiceStruct(Struct):
-    """``Choice`` of ``covariance.cpp``, which says what its members are."""
+    """``Choice`` of ``covariance.cpp``, which documents its members."""
 
     members = {
         "means": DOUBLE_POINTER,
@@ -218,7 +218,7 @@ def group_moments(members: Members, group: Tensor, count: int) -> Moments:
                 :, None
             ] * values_of(these)
 
-        for own, values in in_turn(shared, members.pieces(), group.device):
+        for own, values in parallel_map(shared, members.pieces(), group.device):
             add_rows(total, own, values)
     return found
 
@@ -254,7 +254,7 @@ def best_groups(
         inverse[some] = pack(inverses) * (occurrences / variance[:, None])
         log_determinants[some] = logs + 3 * variance.log()
 
-    in_threads(invert, pieces(len(groups.mass), group.device), group.device)
+    parallel_for(invert, pieces(len(groups.mass), group.device), group.device)
     colour_weight = 1 / (2 * settings.regrouping_contrast**2)
 
     result = torch.empty_like(group)
@@ -294,6 +294,6 @@ def best_groups(
         best = fit.nan_to_num_(nan=torch.inf).argmin(1, keepdim=True)  # the first of equals
         result[these] = candidates.gather(1, best)[:, 0]
 
-    in_threads(choose, members.pieces(), group.device)
+    parallel_for(choose, members.pieces(), group.device)
     heaviest = torch.zeros_like(groups.mass).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)

@@ -32,7 +32,7 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.memory import give_back_freed_memory
 from pointsplat_ns.system.tensors import numbers
-from pointsplat_ns.system.threads import in_turn, one_thread_each
+from pointsplat_ns.system.threads import one_thread_each, parallel_map
 from pointsplat_ns.view_sampling.content import in_units, views_in_units
 from pointsplat_ns.view_sampling.sampler import Sampler
 
@@ -272,7 +272,7 @@ def first_step(
                 begin.append(views.prepare)
             if scene.device.type == "cpu":  # other devices use another tree
                 begin.append(import_tree)
-        participants, *_ = in_turn(lambda step: step(), begin, scene.device)
+        participants, *_ = parallel_map(lambda step: step(), begin, scene.device)
         give_back_freed_memory()  # of finished threads
         found = None
         weights = torch.ones_like(participants.members, dtype=torch.float32)

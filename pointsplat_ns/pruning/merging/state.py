@@ -16,7 +16,7 @@ from pointsplat_ns.rendering.constants import ALPHA_MIN
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.pieces import in_pieces, pieces
 from pointsplat_ns.system.tensors import DOUBLES
-from pointsplat_ns.system.threads import in_turn
+from pointsplat_ns.system.threads import parallel_map
 from pointsplat_ns.view_sampling.content import content_size
 
 SAMPLED = 1 << 18
@@ -166,7 +166,7 @@ def principal_axes(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
         values = _coefficients(scene, members[these]) - shift
         return values.sum(0), values.T @ values
 
-    for values, squares in in_turn(sums, parts, members.device):
+    for values, squares in parallel_map(sums, parts, members.device):
         total += values
         products += squares
     mean = total / len(members)

@@ -9,7 +9,7 @@ import torch
 
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import View, Views
-from pointsplat_ns.system.threads import in_turn
+from pointsplat_ns.system.threads import parallel_map
 
 Result = TypeVar("Result")
 
@@ -37,4 +37,4 @@ def each_view(
         return function(scene, views[index])
 
     for first in range(0, len(views), at_once):
-        yield from in_turn(work, range(first, min(first + at_once, len(views))), scene.device)
+        yield from parallel_map(work, range(first, min(first + at_once, len(views))), scene.device)

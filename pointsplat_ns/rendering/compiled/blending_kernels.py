@@ -27,7 +27,7 @@ from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 
 class TaskStruct(Struct):
-    """``Task`` of ``blending.cpp``, which says what its members are."""
+    """``Task`` of ``blending.cpp``, which documents its members."""
 
     members = {
         "table": FLOAT_POINTER,
@@ -185,8 +185,8 @@ def task_of(
 def blend_region(
     grid: Grid, tiles: TileList, table: Tensor, image: Tensor, final: Tensor, keep_tape: bool
 ) -> KernelTape | None:
-    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape
-    if it is wanted."""
+    """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); returns
+    the tape if requested."""
     size = chunk_kernel()
     chunks = torch.zeros_like(tiles.offsets)
     torch.cumsum(
@@ -211,7 +211,7 @@ def weigh(task: Struct, pairs: Tensor, count: int) -> Tensor:
     sums = torch.empty(pairs.numel(), **FLOATS)
     task.fill(sums=sums)
     on_threads(len(sums) >= SEVERAL, weigh_kernel, task)
-    # one thread, in the order of the tiles
+    # one thread, in tile order
     return sums.new_zeros(count).index_add_(0, pairs, sums)
 
 

@@ -28,7 +28,7 @@ from pointsplat_ns.system.tensors import INDICES
 
 
 class ListingStruct(Struct):
-    """``Listing`` of ``tiles.cpp``, which says what its members are."""
+    """``Listing`` of ``tiles.cpp``, which documents its members."""
 
     members = {
         "table": FLOAT_POINTER,

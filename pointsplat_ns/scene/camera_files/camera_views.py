@@ -28,8 +28,7 @@ class Camera(NamedTuple):
     name: str
     """Name of its photo; empty if the file has none."""
     pose: Sequence[float]
-    """4 x 4 camera-to-world matrix, 16 numbers, row-major; OpenCV axes (x right, y down, z
-    forward)."""
+    """Camera-to-world matrix, 16 numbers, row-major; OpenCV axes (x right, y down, z forward)."""
     size: tuple[float, float]
     """Width and height, pixels."""
     focal: tuple[float, float]
@@ -192,8 +191,7 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None) 
 
 
 def photo_order(names: Sequence[str]) -> list[int]:
-    """Camera indices in natural order of photo names, r_2 before r_10; unchanged if a name is
-    missing."""
+    """Camera indices in natural order of photo names, r_2 before r_10; as is if one is missing."""
     order = list(range(len(names)))
     if all(names):
         order.sort(

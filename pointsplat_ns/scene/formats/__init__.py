@@ -18,7 +18,7 @@ from pathlib import Path
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.checkpoints import read_checkpoint
 from pointsplat_ns.scene.formats import sog, splat, spz
-from pointsplat_ns.scene.formats.capacity import Holds
+from pointsplat_ns.scene.formats.capacity import Capacity
 from pointsplat_ns.scene.formats.compressed_ply import is_compressed, read_compressed_ply
 from pointsplat_ns.scene.formats.sog import encode_sog, read_sog, rounded_for_sog
 from pointsplat_ns.scene.formats.sog_images import SOG_META
@@ -44,7 +44,7 @@ class Format:
     write: Callable[[Gaussians, Path, Progress], None] | None = None
     starts: tuple[bytes, ...] = ()
     """Magic numbers at the start of its files, if they identify it."""
-    holds: str = ""
+    zip_member: str = ""
     """Pattern of a file name, without folders, in its zip archives, if that identifies it."""
     instead: str = ""
     """Advice to the user, for a format that is not read."""
@@ -55,7 +55,7 @@ class Format:
     """Encodes a scene, where only the encoded bytes give the file size."""
     rounded: Callable[[Gaussians, float], Gaussians] | None = None
     """Rounds a scene's numbers to make its file smaller, by a tolerance (see :mod:`rounding`)."""
-    capacity: Holds = Holds()
+    capacity: Capacity = Capacity()
     """Range and step of each attribute in its files."""
 
 
@@ -89,7 +89,7 @@ FORMATS = (
         lambda scene, path, _: write_ply(scene, path),
         _PLY,
         bytes_of=ply_bytes,
-        capacity=Holds(offset=True),
+        capacity=Capacity(offset=True),
     ),
     Format(
         "SPZ",
@@ -99,33 +99,35 @@ FORMATS = (
         (b"\x1f\x8b\x08", b"NGSP"),
         encode=encode_spz,
         rounded=rounded_for_spz,
-        capacity=spz.HOLDS,
+        capacity=spz.CAPACITY,
     ),
     Format(
         "SuperSplat project",
         ".ssproj",
-        holds="document.json",
+        zip_member="document.json",
         instead="open it in SuperSplat and export the scene as .ply, .sog or .spz",
     ),
-    Format("zip of a streamed SOG", "", holds=STREAM_META, instead="unpack it and name its folder"),
+    Format(
+        "zip of a streamed SOG", "", zip_member=STREAM_META, instead="unpack it and name its folder"
+    ),
     Format(
         "SOG",
         ".sog",
         read_sog,
         _writer(encode_sog),
-        holds=SOG_META,
+        zip_member=SOG_META,
         encode=encode_sog,
         rounded=rounded_for_sog,
-        capacity=sog.HOLDS,
+        capacity=sog.CAPACITY,
     ),
     Format(
         "checkpoint",
         ".ckpt",
         read_checkpoint,
         starts=(b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P",),
-        holds="data.pkl",
+        zip_member="data.pkl",
     ),
-    Format("streamed SOG", STREAM_META, read_sog_stream, capacity=sog.HOLDS),
+    Format("streamed SOG", STREAM_META, read_sog_stream, capacity=sog.CAPACITY),
     Format("SOG folder", SOG_META, read_sog),
     Format(
         "splat",
@@ -133,19 +135,21 @@ FORMATS = (
         read_splat,
         _writer(encode_splat),
         bytes_of=lambda count, *_: 32 * count,
-        capacity=splat.HOLDS,
+        capacity=splat.CAPACITY,
     ),
-    Format("zip of a PLY", "", holds="*.ply", instead="unpack it and name the PLY"),
+    Format("zip of a PLY", "", zip_member="*.ply", instead="unpack it and name the PLY"),
     Format("ksplat", ".ksplat", instead=_CONVERT),
     Format("LCC", ".lcc", instead=_CONVERT),
     Format("LCC", ".lcc2", instead=_CONVERT),
     Format("Postshot project", ".psht", instead=_EXPORT),
-    Format("RAD", ".rad", instead=_EXPORT, capacity=Holds(antialiased=False)),
-    Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), holds="*.usd[ac]", instead=_EXPORT),
+    Format("RAD", ".rad", instead=_EXPORT, capacity=Capacity(antialiased=False)),
+    Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), zip_member="*.usd[ac]", instead=_EXPORT),
     Format("glTF", ".glb", starts=(b"glTF",), instead=_EXPORT),
-    Format("LAS point cloud", ".las", starts=(b"LASF",), instead="it holds points, no Gaussians"),
     Format(
-        "E57 point cloud", ".e57", starts=(b"ASTM-E57",), instead="it holds points, no Gaussians"
+        "LAS point cloud", ".las", starts=(b"LASF",), instead="it contains points, no Gaussians"
+    ),
+    Format(
+        "E57 point cloud", ".e57", starts=(b"ASTM-E57",), instead="it contains points, no Gaussians"
     ),
     Format(
         "Git LFS pointer",
@@ -215,14 +219,15 @@ def _told_by_zip(path: Path) -> Format | None:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
     except (zipfile.BadZipFile, NotImplementedError, ValueError, RuntimeError) as error:
-        if named is not None and named.holds:
+        if named is not None and named.zip_member:
             return None
         raise SceneError(
             f"{path}: a truncated or damaged zip archive ({one_line(error)})"
         ) from error
     files = [name.rpartition("/")[2].lower() for name in names]
     packed = next(
-        (kind for kind in FORMATS if kind.holds and fnmatch.filter(files, kind.holds)), None
+        (kind for kind in FORMATS if kind.zip_member and fnmatch.filter(files, kind.zip_member)),
+        None,
     )
     if packed is None:
         found = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

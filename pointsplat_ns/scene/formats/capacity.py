@@ -1,8 +1,8 @@
 """The range of each attribute in a format, and the losses of a scene written in it.
 
-Each format declares its ranges (:class:`Holds`). :func:`losses` compares a scene with them before
-it is written. Small losses that the format has by design, such as its steps of sizes, are not
-counted.
+Each format declares its ranges (:class:`Capacity`). Before a scene is written, :func:`losses`
+compares it with them. Small losses that the format has by design, such as its steps of sizes, are
+not counted.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Span:
     step: float = 0.0
     """Distance of neighbouring values; 0 for float32, or if it depends on the scene."""
 
-    def holds(self, values: Tensor) -> Tensor:
+    def contains(self, values: Tensor) -> Tensor:
         """Whether values are in the range, extended by half a step."""
         return (values >= self.low - 0.5 * self.step) & (values <= self.high + 0.5 * self.step)
 
@@ -43,7 +43,7 @@ FLOAT = Span()
 
 
 @dataclass(frozen=True)
-class Holds:
+class Capacity:
     """Ranges of all attributes in a format."""
 
     sizes: Span = FLOAT
@@ -63,21 +63,21 @@ class Holds:
     description of the changes."""
 
 
-def losses(scene: Gaussians, holds: Holds) -> list[str]:
+def losses(scene: Gaussians, capacity: Capacity) -> list[str]:
     """Losses of a scene, float32 on the CPU, in a format: one clause with numbers per attribute.
     An attribute is omitted if the format can hold it, or if it changes in at most 1 % of the
     Gaussians, by their weight in renders."""
     found = []
-    if scene.antialiased and not holds.antialiased:
+    if scene.antialiased and not capacity.antialiased:
         found.append("the flag for antialiased training")
-    if scene.offset is not None and not holds.offset:
+    if scene.offset is not None and not capacity.offset:
         found.append(f"the position offset {offset_text(scene.offset)}")
     if not len(scene):
         return found
-    fitted, moved = (scene, "") if holds.fitted is None else holds.fitted(scene)
+    fitted, moved = (scene, "") if capacity.fitted is None else capacity.fitted(scene)
     found += [moved] if moved else []
-    if holds.position_steps is not None:
-        steps = holds.position_steps(fitted).double()
+    if capacity.position_steps is not None:
+        steps = capacity.position_steps(fitted).double()
         times = float((steps / typical_sizes(fitted)).median())
         misplaced = _share(steps > fitted.scales.double().amax(dim=1).exp(), fitted)
         if times > 0.25:  # at a quarter, renders have about 42 to 52 dB
@@ -91,17 +91,17 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
                 "their size"
             )
     ordered = scene.scales.sort(dim=1).values
-    sizes = holds.sizes
+    sizes = capacity.sizes
     # smaller ones are drawn at the smallest size
     drawn = scene.replace(scales=scene.scales.clamp_min(sizes.low))
     found += _cut(ordered[:, 1] < sizes.low, drawn, "smaller", sizes.low, "larger")
     found += _cut(ordered[:, 2] > sizes.high, scene, "larger", sizes.high, "smaller")
-    if holds.sh is None and scene.sh_degree:
+    if capacity.sh is None and scene.sh_degree:
         found.append(
             f"SH of degree {scene.sh_degree} are dropped, so colours no longer depend on the view "
             "direction"
         )
-    error = _colour_errors(scene, fitted, holds)
+    error = _colour_errors(scene, fitted, capacity)
     share = _share(error > 0.2, scene)
     if share > 0.01:
         found.append(
@@ -124,8 +124,7 @@ def seen_colours(dc: Tensor, rest: Tensor) -> Tensor:
 
 
 def _basis(count: int) -> Tensor:
-    """The first ``count`` basis functions above degree 0, (count, D) float64, in directions on a
-    spiral."""
+    """The first ``count`` basis functions above degree 0, (count, D) float64, on a spiral."""
     number = torch.arange(64, **DOUBLES)
     z = 1 - (2 * number + 1) / 64
     angle = number * math.pi * (3 - math.sqrt(5))
@@ -150,7 +149,7 @@ def within_colours(scene: Gaussians, colours: Span, sh: Span) -> Gaussians:
         unseen = (-0.5 - _peaks(rest[dark])) / SH_C0  # black in all directions if dc is lower
         dc = dc.index_put(dark, torch.maximum(dc[dark], unseen.clamp_max(_DARKEST)))
         scene = scene.replace(features_dc=dc)
-    outside = ~(colours.holds(dc) & sh.holds(rest).all(dim=2))
+    outside = ~(colours.contains(dc) & sh.contains(rest).all(dim=2))
     if not bool(outside.any()):
         return scene
     new_dc = dc.clone()
@@ -200,21 +199,21 @@ def _peaks(rest: Tensor) -> Tensor:
     return rest.norm(dim=1) * math.sqrt(rest.shape[1] / (4 * math.pi))
 
 
-def _colour_errors(scene: Gaussians, fitted: Gaussians, holds: Holds) -> Tensor:
+def _colour_errors(scene: Gaussians, fitted: Gaussians, capacity: Capacity) -> Tensor:
     """Largest colour error (N,) over directions and channels after clipping the fitted scene to the
     ranges. Bands that the format drops are not counted."""
-    kept = scene.features_rest.shape[1] if holds.sh is not None else 0
-    span = holds.sh or FLOAT
+    count = scene.features_rest.shape[1] if capacity.sh is not None else 0
+    span = capacity.sh or FLOAT
     pairs = [
-        (one.features_dc, one.features_rest[:, :kept].transpose(1, 2)) for one in (scene, fitted)
+        (one.features_dc, one.features_rest[:, :count].transpose(1, 2)) for one in (scene, fitted)
     ]
     (dc, rest), (new_dc, new_rest) = pairs
     error = torch.zeros_like(dc)
-    changed = ~(holds.colours.holds(dc) & span.holds(rest).all(dim=2)) | (dc != new_dc)
+    changed = ~(capacity.colours.contains(dc) & span.contains(rest).all(dim=2)) | (dc != new_dc)
     for part in changed.nonzero().split(16_384):
         at = part[:, 0], part[:, 1]
         held = (
-            new_dc[at].clamp(holds.colours.low, holds.colours.high),
+            new_dc[at].clamp(capacity.colours.low, capacity.colours.high),
             new_rest[at].clamp(span.low, span.high),
         )
         error[at] = (seen_colours(*held) - seen_colours(dc[at], rest[at])).abs().amax(dim=1)

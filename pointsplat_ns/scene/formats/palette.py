@@ -133,8 +133,7 @@ def palette(
 
 
 def _piece_of(rows: Tensor, k: int) -> Tensor:
-    """Piece of each row (N, D): ``k`` pieces of similar size along the column of largest
-    variance."""
+    """Piece of each row (N, D): ``k`` pieces of similar size along the most varying column."""
     order = rows[:, int(rows.var(dim=0).argmax())].argsort(stable=True)
     pieces = torch.empty(len(rows), **INDICES)
     pieces[order] = torch.arange(len(rows), **INDICES) * k // len(rows)

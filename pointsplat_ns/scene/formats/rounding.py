@@ -45,8 +45,7 @@ class RoundingSettings:
     contrast: float = 0.22
     """Contrast of a Gaussian with its surroundings, a share of the colour range."""
     thinnest: float = 0.1
-    """Smallest standard deviation of an axis relative to the longest axis; thinner axes are drawn
-    thicker."""
+    """Minimum standard deviation of an axis, relative to the longest; thinner axes are widened."""
     palette_error: float = 2.5
     """Colour error of an SH palette, in tolerances. Finer colours take more bytes than fewer
     Gaussians save."""
@@ -82,8 +81,7 @@ def weights(scene: Gaussians) -> Tensor:
 
 
 def steps_of(scene: Gaussians, tolerance: float) -> Steps:
-    """Steps of N drawable Gaussians on the CPU; ``tolerance`` is for a Gaussian of typical
-    weight."""
+    """Steps of N drawable Gaussians on the CPU; ``tolerance`` is for a typical weight."""
     each = (tolerance * weights(scene).rsqrt())[:, None]
     uniform = math.sqrt(12)  # step whose rounding has a root mean squared error of 1
     shape = uniform * each / ROUNDING.contrast

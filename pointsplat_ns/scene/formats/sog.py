@@ -24,7 +24,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.scene.formats import coding
-from pointsplat_ns.scene.formats.capacity import Holds, Span
+from pointsplat_ns.scene.formats.capacity import Capacity, Span
 from pointsplat_ns.scene.formats.coding import Array
 from pointsplat_ns.scene.formats.palette import LEVELS, codebook, palette
 from pointsplat_ns.scene.formats.rounding import (
@@ -149,8 +149,7 @@ def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
 
 
 def _looked_up(part: dict[str, Any], pixels: Array, channels: int) -> Array:
-    """Values (N, channels) float32 of bytes: codebook entries, or in version 1 shares between
-    bounds."""
+    """Values (N, channels) float32: codebook entries, or in version 1 shares between bounds."""
     book = part.get("codebook")
     if book is None:
         low, high = (np.broadcast_to(_numbers(part[name]), channels) for name in ("mins", "maxs"))
@@ -193,7 +192,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
 
     levels, mins, maxs, _ = _levels_of(scene)
     steps = np.rint(levels).astype(np.int64)
-    scales, scale_index = codebook(scene.scales.clamp_min(HOLDS.sizes.low))  # -Inf of flat axes
+    scales, scale_index = codebook(scene.scales.clamp_min(CAPACITY.sizes.low))  # -Inf of flat axes
     colors, color_index = codebook(scene.features_dc)
     largest, others = coding.smallest_three(coding.unit_quats(scene))
     meta: dict[str, Any] = {
@@ -256,7 +255,9 @@ def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array, Tensor]:
     )
 
 
-HOLDS = Holds(sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[3].amax(dim=1))
+CAPACITY = Capacity(
+    sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[3].amax(dim=1)
+)
 
 
 def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
@@ -286,8 +287,7 @@ def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
     most = min(len(scene) // 2, 65_536)
 
     def made(share: float) -> tuple[Tensor, Tensor, float]:
-        """A palette of a given size, the entry index of each Gaussian, and the error of a
-        coefficient."""
+        """A palette of a given size, each Gaussian's entry, and the error of a coefficient."""
         book, index = palette(rows, 64 * max(int(share / 64), 1), each, lambda done: None)
         return (
             book,

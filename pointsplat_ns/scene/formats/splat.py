@@ -15,14 +15,14 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.scene.formats import coding
-from pointsplat_ns.scene.formats.capacity import Holds, Span
+from pointsplat_ns.scene.formats.capacity import Capacity, Span
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.files import require_file, require_memory
 from pointsplat_ns.system.progress import Progress, silent
 
 _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
-HOLDS = Holds(
+CAPACITY = Capacity(
     colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)), sh=None, antialiased=False
 )
 

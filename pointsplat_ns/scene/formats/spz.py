@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.formats import coding
-from pointsplat_ns.scene.formats.capacity import Holds, Span, typical_sizes, within_colours
+from pointsplat_ns.scene.formats.capacity import Capacity, Span, typical_sizes, within_colours
 from pointsplat_ns.scene.formats.coding import Array, Blocks
 from pointsplat_ns.scene.formats.rounding import rounded
 from pointsplat_ns.scene.gaussians import MAX_SH_DEGREE, Gaussians
@@ -140,8 +140,8 @@ def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
     coarse, they move towards the median position and shrink in proportion: seen from there, they
     look the same. Colours are those of :func:`within_colours`.
     """
-    assert HOLDS.sh is not None
-    scene = within_colours(scene, HOLDS.colours, HOLDS.sh)
+    assert CAPACITY.sh is not None
+    scene = within_colours(scene, CAPACITY.colours, CAPACITY.sh)
     if not len(scene):
         return scene, ""
     needed = _needed_bits(scene)
@@ -212,7 +212,7 @@ def _position_steps(scene: Gaussians) -> Tensor:
     return scene.means.new_full((len(scene),), math.ldexp(1.0, -fraction_bits(scene)))
 
 
-HOLDS = Holds(
+CAPACITY = Capacity(
     sizes=Span(-10.0, -10.0 + 255 / 16, 1 / 16),
     colours=Span(-0.5 / _COLOUR_SCALE, 0.5 / _COLOUR_SCALE, 1 / (255 * _COLOUR_SCALE)),
     sh=Span(-1.0, 127 / 128, 1 / 128),
@@ -291,22 +291,24 @@ def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
 def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:
     n = head.count
     positions, alphas, colors, scales, quats, sh = (np.frombuffer(part, np.uint8) for part in parts)
-    kept = min(head.rest, (MAX_SH_DEGREE + 1) ** 2 - 1)
+    rest = min(head.rest, (MAX_SH_DEGREE + 1) ** 2 - 1)
     return coding.scene_of(
         _from_fixed_point(positions.reshape(n, 3, 3), head.fraction_bits),
-        scales.reshape(n, 3).astype(np.float32) * np.float32(HOLDS.sizes.step)
-        + np.float32(HOLDS.sizes.low),
+        scales.reshape(n, 3).astype(np.float32) * np.float32(CAPACITY.sizes.step)
+        + np.float32(CAPACITY.sizes.low),
         _quats_of_three(quats) if head.version == 2 else _quats_of_four(quats),
         coding.logits_of_bytes(alphas),
         (colors.reshape(n, 3).astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE,
-        (sh.reshape(n, head.rest, 3)[:, :kept].astype(np.float32) - 128) / 128,
+        (sh.reshape(n, head.rest, 3)[:, :rest].astype(np.float32) - 128) / 128,
     )
 
 
 def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes]:
     """The attributes in file order."""
     bands = scene.features_rest[:, :3], scene.features_rest[:, 3:]  # degree 1, and above
-    first, other = (_coarse(rest.numpy(), kept) for rest, kept in zip(bands, sh_bits, strict=True))
+    first, other = (
+        _coarse(band.numpy(), count) for band, count in zip(bands, sh_bits, strict=True)
+    )
     fixed = np.rint(np.ldexp(scene.means.double().numpy(), bits)).astype("<i4")
     largest, others = coding.smallest_three(coding.unit_quats(scene)[:, _XYZW])
     magnitudes = (
@@ -323,7 +325,9 @@ def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes
         np.ascontiguousarray(fixed[..., None]).view(np.uint8)[..., :3].tobytes(),
         coding.bytes_of_logits(scene).tobytes(),
         coding.to_bytes((scene.features_dc.double().numpy() * _COLOUR_SCALE + 0.5) * 255).tobytes(),
-        coding.to_bytes((scene.scales.double() - HOLDS.sizes.low) / HOLDS.sizes.step).tobytes(),
+        coding.to_bytes(
+            (scene.scales.double() - CAPACITY.sizes.low) / CAPACITY.sizes.step
+        ).tobytes(),
         words.astype("<u4").tobytes(),
         np.concatenate([first, other], axis=1).tobytes(),
     ]
@@ -351,8 +355,7 @@ def _quats_of_three(packed: Array) -> Array:
 
 
 def _quats_of_four(packed: Array) -> Array:
-    """Version 3 and later: index of the largest component; nine bits and a sign for each of the
-    others."""
+    """From version 3: index of the largest component; nine bits and a sign for the others."""
     words = packed.view("<u4")
     levels = (
         np.stack([words >> shift & 511 for shift in (20, 10, 0)], axis=1).astype(np.float32) / 511

@@ -23,7 +23,7 @@ from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import PlyRows, header_bytes, read_ply, row_table, write_ply
 from pointsplat_ns.view_sampling.sampler import Sampler, sample_views
-from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS, use_settings
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -90,7 +90,7 @@ def test_views_and_weights_are_those_of_merging_in_memory(scene, tolerance, tmp_
     scene.opacities[::7] = -9.0  # too faint
     monkeypatch.setattr(state, "SAMPLED", 1 << 9)
     settings = replace(MERGING, sampled_views=4, min_count_rendered=0, max_count_drawn=600)
-    with use_settings(replace(SHIPPED, sampled_count=900)):
+    with use_settings(replace(DEFAULT_SETTINGS, sampled_count=900)):
         _, weights = views_and_weights(
             Participants.of(scene, drawable(scene, 400)), Sampler(scene), settings
         )
@@ -106,7 +106,7 @@ def test_cells_lose_no_more_than_the_whole_and_leave_no_seam(tmp_path):
     rows = rows_of(scene, tmp_path)
     k = 300
     settings = replace(MERGING, sampled_views=8, finish_views=2, min_count_rendered=0)
-    with use_settings(SHIPPED):
+    with use_settings(DEFAULT_SETTINGS):
         whole = merge(scene, k, settings=settings).scene
         parts = merged(rows, k, 750, tmp_path, settings)
         reference = DenseReference(scene, sample_views(scene, 6, width=80, height=60, seed=9))

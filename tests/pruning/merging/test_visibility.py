@@ -16,7 +16,7 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.poses import look_at
 from pointsplat_ns.view_sampling.sampler import Sampler, sample_views
-from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
+from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS, use_settings
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -106,7 +106,7 @@ def test_traces_count_where_sh_tell_of_photos_and_fog_has_no_views(monkeypatch):
         visibility, "trace_factors", lambda scene, members: torch.full((len(members),), 16.0)
     )
     # Without SH, all are sure.
-    all_sure = replace(SHIPPED, min_size_evidence=-1.0)
+    all_sure = replace(DEFAULT_SETTINGS, min_size_evidence=-1.0)
     settings = replace(MERGING, sampled_views=2, min_count_rendered=0)
     fog = ball(200).replace(opacities=torch.full((200, 1), -math.inf))
     for scene, weight in ((photographed(), 8.0), (ball(500, 0), 0.5), (fog, 1.0)):

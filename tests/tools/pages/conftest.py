@@ -7,7 +7,7 @@ import pytest
 
 import pointsplat_ns as ps
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.tools.pages import slider_scenes as kept
+from pointsplat_ns.tools.pages import slider_scenes
 from room_views import room_views
 
 
@@ -42,5 +42,5 @@ def endless(monkeypatch) -> tuple[threading.Event, threading.Event]:
         finally:
             ended.set()
 
-    monkeypatch.setattr(kept.Merger, "merged", merged)
+    monkeypatch.setattr(slider_scenes.Merger, "merged", merged)
     return begun, ended

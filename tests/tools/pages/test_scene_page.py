@@ -120,7 +120,7 @@ def test_too_large_a_page_leaves_the_larger_scene_out_and_says_so(written, rooms
             [ball(9).replace(opacities=torch.full((9, 1), -math.inf))],
             {},
             ps.DataError,
-            "nothing .* can be seen",
+            "nothing .* is visible",
         ),
         ([ball(9), ball(9)[:0]], {}, ps.SceneError, "holds no Gaussians that can be drawn"),
     ],

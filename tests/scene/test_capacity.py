@@ -16,7 +16,7 @@ from pointsplat_ns.scene.formats import FORMATS
 from pointsplat_ns.scene.formats.capacity import FLOAT, seen_colours, within_colours
 from pointsplat_ns.scene.formats.coding import morton_order
 from pointsplat_ns.scene.formats.splat import drawing_order
-from pointsplat_ns.scene.formats.spz import FARTHEST, HOLDS, fraction_bits
+from pointsplat_ns.scene.formats.spz import CAPACITY, FARTHEST, fraction_bits
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -143,7 +143,7 @@ def test_spz_lowers_base_and_sh_together_and_names_what_is_lost(tmp_path, caplog
     after = psnr_of_file(scene, tmp_path / "a.spz")
     assert "of the Gaussians have colours out of range" in loss_text(caplog)
     cut = scene.replace(
-        features_dc=scene.features_dc.clamp(HOLDS.colours.low, HOLDS.colours.high),
+        features_dc=scene.features_dc.clamp(CAPACITY.colours.low, CAPACITY.colours.high),
         features_rest=scene.features_rest.clamp(-1, 1),
     )
     with torch.no_grad():
@@ -154,7 +154,7 @@ def test_spz_lowers_base_and_sh_together_and_names_what_is_lost(tmp_path, caplog
 def test_a_splat_names_sh_and_antialiasing_that_it_does_not_hold(tmp_path, caplog):
     ps.save(room().replace(antialiased=True), tmp_path / "a.splat")
     text = loss_text(caplog)
-    assert "SH of degree 1 are left out" in text and "the flag for antialiased training" in text
+    assert "SH of degree 1 are dropped" in text and "the flag for antialiased training" in text
     assert text.endswith(".sog keeps it") and str(tmp_path / "a.splat") in text
 
 
