@@ -193,6 +193,7 @@ class StoppableTrainer(Trainer):
                         f"Saved after step {self.step - 1}. The run is usable as it is; to go on: "
                         f"--load-dir {self.checkpoint_dir}"
                     )
+                    self.show_progress()
                 _interrupted(self._asked or signal.SIGINT)
 
     @contextmanager
@@ -237,6 +238,9 @@ class StoppableTrainer(Trainer):
             ) from error
         self.step = self._start_step
         log(f"going on after step {content['step']} of {path}")
+
+    def show_progress(self) -> None:
+        """Write what tells how far an interrupted training came; nothing by default."""
 
     def put_back(self, state: Any) -> None:
         """Put back :meth:`state_to_resume`; None if the checkpoint has none."""

@@ -205,14 +205,17 @@ class PointSplatTrainer(StoppableTrainer):
             return
         for scene in sorted(measured.gains, key=lambda scene: not scene.trained_on):
             kind = "trained on" if scene.trained_on else "not trained on"
-            say(
-                f"{scene.name} ({kind}): pruned {scene.pruned:.1f} -> refined {scene.refined:.1f} "
-                "dB "
-                f"({scene.gain:+.1f}) in {counted(scene.views, 'view')}"
-            )
+            change = f"pruned {scene.pruned:.1f} -> refined {scene.refined:.1f} dB"
+            views = counted(scene.views, "view")
+            say(f"{scene.name} ({kind}): {change} ({scene.gain:+.1f}) in {views}")
         say(verdict(measured.gains))
         say(f"see {', '.join(map(str, self.draw()))}")
         say(f"all held-out photos: ns-eval --load-config {self.base_dir / RUN_FILES.config}")
+
+    def show_progress(self) -> None:
+        """See the base class: what :meth:`draw` writes."""
+        if self.progress.curves.measurements and processes.rank() == 0:
+            say(f"see {', '.join(map(str, self.draw()))}")
 
     def draw(self) -> list[Path]:
         """Write the table, the curves and the sheet of views; their paths."""

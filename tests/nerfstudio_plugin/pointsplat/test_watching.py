@@ -49,8 +49,8 @@ def gain_of(own: float | None, others: float | None) -> list[SceneGain]:
         (
             0.0,
             0.0,
-            "gains nothing in its own scenes, gains nothing in others: more steps, or higher "
-            "rates (--rate-factor)",
+            "gains nothing in its own scenes, gains nothing in others: more steps, or higher rates "
+            "(--rate-factor)",
         ),
         (-1.0, None, "loses 1.0 dB in its own scenes: more steps, or higher rates (--rate-factor)"),
         (None, 0.5, "gains 0.5 dB in scenes that it was not trained on"),
@@ -236,3 +236,12 @@ def test_a_dense_scene_is_its_own_photo(three_rooms, run_training, tmp_path):
     trainer, _ = run_training(config)
     assert list(trainer.progress.pictures(0)) == ["dense", "pruned", "refined"]
     assert (trainer.base_dir / "views.png").is_file()
+
+
+def test_an_interrupted_training_draws_how_far_it_came(watched):
+    trainer, _, _ = watched
+    paths = [trainer.base_dir / name for name in ("training.csv", "training.png", "views.png")]
+    for path in paths:
+        path.unlink()
+    trainer.show_progress()
+    assert all(path.is_file() for path in paths)
