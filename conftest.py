@@ -1,5 +1,10 @@
-"""What keeps tests and the examples in docstrings quick: few and small views, no repair, coarse
-rooms."""
+"""Fixtures that tests and the examples in docstrings ask for by name.
+
+Without them everything runs as it ships. A module of tests that are about something else than
+views and repairs asks for ``quick``:
+
+    pytestmark = pytest.mark.usefixtures("quick")
+"""
 
 from __future__ import annotations
 
@@ -8,40 +13,14 @@ from collections.abc import Iterator
 import pytest
 
 from lab.rooms import light
-from pointsplat_ns import view_source
-from pointsplat_ns.compression import repair
-from pointsplat_ns.looking.settings import changed
-from quick_looking import QUICK, USUAL
-
-
-@pytest.fixture(scope="session", autouse=True)
-def quick_looking() -> Iterator[None]:
-    """Views are chosen from few candidates, unless a test is about which are chosen."""
-    with changed(QUICK):
-        yield
+from quick import quick_settings
 
 
 @pytest.fixture(scope="module")
-def usual_looking() -> Iterator[None]:
-    """The settings of looking as they ship, for tests of what they are good for."""
-    with changed(USUAL):
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def small_views_by_default() -> Iterator[None]:
-    """Where no views are given, those that renders are compared in have 64 x 48 pixels."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view_source, "RESOLUTION", (64, 48))
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def no_repair_by_default() -> Iterator[None]:
-    """``compact`` optimises for seconds unless told otherwise; here only those tests wait for it
-    that are about it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(repair.STEPS, "quick", 0)
+def quick() -> Iterator[None]:
+    """Few and small views, no repair: see :func:`quick.quick_settings`. Fixtures of a session run
+    before this one; those that sample views ask for :func:`quick_settings` themselves."""
+    with quick_settings():
         yield
 
 
@@ -53,7 +32,9 @@ def coarse_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def coarse_rooms_in_examples(request: pytest.FixtureRequest) -> None:
-    """An example shows how a room is made, and not how it looks."""
+def quick_examples(request: pytest.FixtureRequest) -> None:
+    """Examples in docstrings, which cannot ask, show how functions are called, not how good they
+    are."""
     if isinstance(request.node, pytest.DoctestItem):
+        request.getfixturevalue("quick")
         request.getfixturevalue("coarse_rooms")

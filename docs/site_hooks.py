@@ -22,8 +22,8 @@ ROOT = Path(__file__).parents[1]
 ELSEWHERE = {
     "CONTRIBUTING.md": "project/contributing.md",
     "CHANGELOG.md": "project/changelog.md",
-    "pointsplat_ns/refiner/pretrained/CARD.md": "project/refiner.md",
-    "pointsplat_ns/refiner/pretrained/FEEDBACK.md": "project/feedback.md",
+    "pointsplat_ns/refinement/pretrained/CARD.md": "project/refiner.md",
+    "pointsplat_ns/refinement/pretrained/FEEDBACK.md": "project/feedback.md",
 }
 """Pages outside docs/, by path in the repository, and where the site has them."""
 

@@ -23,14 +23,14 @@ from lab.common.running import run as run_command
 from pointsplat_ns.errors import need
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
-from pointsplat_ns.io.files import need_folder
-from pointsplat_ns.io.pictures import write_picture
-from pointsplat_ns.io.runs import METHOD_NAMES
-from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.metrics.lpips import WEIGHTS_VARIABLE
+from pointsplat_ns.scene.image_files import write_picture
+from pointsplat_ns.scene.runs import METHOD_NAMES
+from pointsplat_ns.system.files import need_folder
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.terminal import print_table
+from pointsplat_ns.view_sampling.poses import look_at, views_of
 
 
 class DemoSettings(NamedTuple):

@@ -20,21 +20,22 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.comparing.sizes import RESOLUTION, middle_sized, several_sizes
-from pointsplat_ns.compression.feedback import REPAIR, Feedback
-from pointsplat_ns.compression.optimiser import gradients_of
-from pointsplat_ns.compression.repair import initial_rate_factor, rate_factor
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.pipeline.feedback_features import REPAIR, Feedback
+from pointsplat_ns.pipeline.optimiser import gradients_of
+from pointsplat_ns.pipeline.repair import initial_rate_factor
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
+from pointsplat_ns.refinement.feedback import FeedbackRefiner, save_feedback_refiner
+from pointsplat_ns.refinement.schedules import cosine_factor
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
+from pointsplat_ns.rendering.comparison.sizes import RESOLUTION, middle_sized, several_sizes
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.threads import one_thread_each
-from pointsplat_ns.view_source import VIEW_COUNTS
-from pointsplat_ns.views import View, Views
+from pointsplat_ns.view_sampling.sampler import sample_views
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ def roll_out(
             gradients_of(now.detach(), view, scene.target(chosen[step]), backend=TRAINING.backend)
         )
         factors = network(feedback.features(now.detach(), step / steps, steps))
-        now = feedback.moved(now, factor * rate_factor(step / steps), factors)
+        now = feedback.moved(now, factor * cosine_factor(step / steps, REPAIR.last_factor), factors)
         if step + 1 in measured:
             psnrs = [
                 _decibels(_drawn(now, scene, index), scene.target(index))
@@ -228,7 +229,7 @@ def train_feedback(
     done = 0.0
     while done < 1:
         adam.param_groups[0]["lr"] = (
-            rate * min(1, (update + 1) / TRAINING.warm_up) * rate_factor(done)
+            rate * min(1, (update + 1) / TRAINING.warm_up) * cosine_factor(done, REPAIR.last_factor)
         )
         adam.zero_grad()
         for number in range(at_once):

@@ -366,9 +366,9 @@ def main(
     import pointsplat_ns as ps
     from lab.common.printing import markdown
     from pointsplat_ns.pruning import paper, select, view_scores
-    from pointsplat_ns.refiner.refiner import gaussian_features
-    from pointsplat_ns.refiner.structure import unit_cube
-    from pointsplat_ns.refiner.weights import SHIPPED_REFINER, read_refiner
+    from pointsplat_ns.refinement.refiner import gaussian_features
+    from pointsplat_ns.refinement.structure import unit_cube
+    from pointsplat_ns.refinement.weights import SHIPPED_REFINER, read_refiner
 
     loaded = ps.load(scene)
     with tempfile.TemporaryDirectory() as folder:

@@ -16,7 +16,7 @@ import tyro
 import pointsplat_ns as ps
 from lab.common.printing import start as start_program
 from lab.feedback_training import TrainingScene, train_feedback
-from pointsplat_ns.refiner.feedback import read_feedback_refiner
+from pointsplat_ns.refinement.feedback import read_feedback_refiner
 from pointsplat_ns.system.processes import connect_torchrun, local_rank, torchrun_rank
 from pointsplat_ns.system.progress import progress_bar, tracked
 from pointsplat_ns.system.threads import fixed_threads

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import tyro
 from PIL import Image
 
-from pointsplat_ns.io.files import bytes_text
+from pointsplat_ns.system.files import bytes_text
 
 UNSAID = ("inf", "nan", "told", "beyond", "closer in", "no difference", "Traceback")
 """Words that no screen and no page has."""

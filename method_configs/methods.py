@@ -8,8 +8,8 @@ from pointsplat_ns.nerfstudio_plugin.registration import errors_in_one_line, loa
 
 
 def _splatfacto_cpu() -> MethodSpecification:
-    from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
+    from pointsplat_ns.scene.checkpoints import allow_splatfacto_checkpoints
 
     allow_splatfacto_checkpoints()
     errors_in_one_line()

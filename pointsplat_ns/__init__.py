@@ -25,11 +25,15 @@ TYPE_CHECKING = (
 if TYPE_CHECKING:
     from typing import Any
 
-    from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
-    from pointsplat_ns.compacting import clean
-    from pointsplat_ns.compression.compacted import Compacted
-    from pointsplat_ns.compression.pictures import plot_comparison
-    from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
+    from pointsplat_ns.api import (
+        Compacted,
+        clean,
+        compact,
+        example_room,
+        lod,
+        plot_views,
+        prune,
+    )
     from pointsplat_ns.errors import (
         BudgetError,
         DataError,
@@ -37,34 +41,44 @@ if TYPE_CHECKING:
         PointSplatError,
         SceneError,
     )
-    from pointsplat_ns.filming import open_viewer, render_path
-    from pointsplat_ns.folders import SceneResult, compact_folder
-    from pointsplat_ns.gaussians import Gaussians
-    from pointsplat_ns.io.scene import save
-    from pointsplat_ns.levels.levels import Levels
-    from pointsplat_ns.looking.sampling import sample_views
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.metrics.lpips import lpips
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-    from pointsplat_ns.pages.scene_page import write_page
-    from pointsplat_ns.placing import place
-    from pointsplat_ns.rasterizer import rasterization, render
-    from pointsplat_ns.scene_info import SceneInfo, info
-    from pointsplat_ns.tradeoff.points import Tradeoff
-    from pointsplat_ns.tradeoff.table import measure_tradeoff
-    from pointsplat_ns.views import View, Views
+    from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner, load_refiner, refine
+    from pointsplat_ns.rendering import rasterization, render
+    from pointsplat_ns.scene.gaussians import Gaussians
+    from pointsplat_ns.scene.reading import save
+    from pointsplat_ns.scene.views import View, Views
+    from pointsplat_ns.tools.comparison_plots import plot_comparison
+    from pointsplat_ns.tools.filming import open_viewer, render_path
+    from pointsplat_ns.tools.folders import SceneResult, compact_folder
+    from pointsplat_ns.tools.levels.levels import Levels
+    from pointsplat_ns.tools.loading import load
+    from pointsplat_ns.tools.pages.scene_page import write_page
+    from pointsplat_ns.tools.placing import place
+    from pointsplat_ns.tools.scene_info import SceneInfo, info
+    from pointsplat_ns.tools.tradeoff.measure_table import measure_tradeoff
+    from pointsplat_ns.tools.tradeoff.points import Tradeoff
+    from pointsplat_ns.view_sampling.sampler import sample_views
 
 _PUBLIC = {
-    "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune"),
-    "pointsplat_ns.compacting": ("clean",),
-    "pointsplat_ns.compression.compacted": ("Compacted",),
-    "pointsplat_ns.levels.levels": ("Levels",),
-    "pointsplat_ns.compression.pictures": ("plot_comparison",),
-    "pointsplat_ns.placing": ("place",),
-    "pointsplat_ns.scene_info": ("SceneInfo", "info"),
-    "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),
-    "pointsplat_ns.pages.scene_page": ("write_page",),
-    "pointsplat_ns.looking.sampling": ("sample_views",),
+    "pointsplat_ns.api": (
+        "Compacted",
+        "clean",
+        "compact",
+        "example_room",
+        "lod",
+        "plot_views",
+        "prune",
+    ),
+    "pointsplat_ns.tools.levels.levels": ("Levels",),
+    "pointsplat_ns.tools.comparison_plots": ("plot_comparison",),
+    "pointsplat_ns.tools.loading": ("load",),
+    "pointsplat_ns.tools.placing": ("place",),
+    "pointsplat_ns.tools.scene_info": ("SceneInfo", "info"),
+    "pointsplat_ns.pipeline.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),
+    "pointsplat_ns.tools.pages.scene_page": ("write_page",),
+    "pointsplat_ns.view_sampling.sampler": ("sample_views",),
     "pointsplat_ns.errors": (
         "BudgetError",
         "DataError",
@@ -72,17 +86,17 @@ _PUBLIC = {
         "PointSplatError",
         "SceneError",
     ),
-    "pointsplat_ns.folders": ("SceneResult", "compact_folder"),
-    "pointsplat_ns.gaussians": ("Gaussians",),
-    "pointsplat_ns.io.scene": ("save",),
-    "pointsplat_ns.filming": ("open_viewer", "render_path"),
+    "pointsplat_ns.tools.folders": ("SceneResult", "compact_folder"),
+    "pointsplat_ns.scene.gaussians": ("Gaussians",),
+    "pointsplat_ns.scene.reading": ("save",),
+    "pointsplat_ns.tools.filming": ("open_viewer", "render_path"),
     "pointsplat_ns.metrics": ("psnr", "ssim"),
     "pointsplat_ns.metrics.lpips": ("lpips",),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
-    "pointsplat_ns.tradeoff.table": ("measure_tradeoff",),
-    "pointsplat_ns.rasterizer": ("rasterization", "render"),
-    "pointsplat_ns.tradeoff.points": ("Tradeoff",),
-    "pointsplat_ns.views": ("View", "Views"),
+    "pointsplat_ns.tools.tradeoff.measure_table": ("measure_tradeoff",),
+    "pointsplat_ns.rendering": ("rasterization", "render"),
+    "pointsplat_ns.tools.tradeoff.points": ("Tradeoff",),
+    "pointsplat_ns.scene.views": ("View", "Views"),
 }
 """Public names by the module that defines them."""
 

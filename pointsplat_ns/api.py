@@ -8,79 +8,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pointsplat_ns.compacting import Looking, Source, compact_source, log, prune_source, read_source
-from pointsplat_ns.compression.compacted import Compacted
-from pointsplat_ns.compression.pictures import plot_views as draw_views
-from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
-from pointsplat_ns.compression.trained_refiner import (
+from pointsplat_ns.pipeline import run
+from pointsplat_ns.pipeline.options import CompactOptions, PruneOptions, ViewOptions
+from pointsplat_ns.pipeline.repair_budget import Effort, RepairBudget
+from pointsplat_ns.pipeline.report import Report
+from pointsplat_ns.pipeline.subject import Source, read_subject
+from pointsplat_ns.pipeline.trained_refiner import (
     TrainedRefiner,
-    load_refiner,
-    open_refiner_run,
-    refine,
-    scenes_of_run,
 )
-from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.runs import may_be_run, open_run
-from pointsplat_ns.io.scene import read_scene, source_file
-from pointsplat_ns.levels.levels import LevelOutput, Levels, make_levels, parse_levels
 from pointsplat_ns.pruning import Keep
+from pointsplat_ns.scene.formats import format_to_write
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.reading import read_scene, source_file
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.outputs import outputs_claimed
 from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.system.quantities import parse_megabytes
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.views import Views
+from pointsplat_ns.tools.comparison_plots import plot_cleaning
+from pointsplat_ns.tools.comparison_plots import plot_views as draw_views
+from pointsplat_ns.tools.levels.levels import LevelOutput, Levels, make_levels, parse_levels
+from pointsplat_ns.tools.wording import (
+    cleaning_lines,
+    log_lines,
+    log_report,
+    note_lines,
+    verdict_text,
+)
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
 """The shipped example scene."""
-
-
-def load(path: str | Path, scene: str | None = None, data: str | Path | None = None) -> Gaussians:
-    """Read a scene.
-
-    Args:
-        path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder,
-            ``.splat``), a checkpoint of Splatfacto or gsplat, a Splatfacto run (its folder or
-            ``config.yml``), or a ``pointsplat`` run, whose dense scene is then pruned and refined
-            as in its training.
-        scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else
-            the first.
-        data: folder of the scenes of a ``pointsplat`` run, if they are no longer where the run
-            says.
-
-    Returns:
-        The scene, float32 on the CPU. Log-scales and logits are those of the file.
-
-    Raises:
-        SceneError: if the path is none of these, is damaged, or has no such scene.
-
-    Example:
-        >>> import tempfile
-        >>> import pointsplat_ns as ps
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     ps.save(ps.example_room()[:100], f"{folder}/some.ply")
-        ...     len(ps.load(f"{folder}/some.ply"))
-        100
-    """
-    if not _is_refiner_run(path):
-        if scene is not None:
-            raise SceneError(f"scene {scene!r}: {path} holds one scene; leave the name out")
-        return read_scene(path)
-    scenes, default = scenes_of_run(open_refiner_run(path, need_data=True, data=data))
-    chosen = default if scene is None else scene
-    if chosen not in scenes:
-        raise SceneError(
-            f"scene {chosen!r}: no such scene in {path}; there are {', '.join(scenes)}"
-        )
-    refiner = load_refiner(path)
-    settings = refiner.settings
-    refined = refine(settings.prune(read_scene(scenes[chosen])), refiner)
-    log(
-        (
-            f"{chosen}: pruned by {settings.by} (keep {settings.keep:g}) and refined, as in the "
-            "training",
-        )
-    )
-    return refined
 
 
 def example_room() -> Gaussians:
@@ -110,6 +67,8 @@ def prune(
     up: str | None = None,
     data: str | Path | None = None,
     photos: bool | str | Path = False,
+    memory: float | str | None = None,
+    jobs: int | None = None,
     progress: bool | Progress = False,
 ) -> Gaussians:
     """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are
@@ -143,6 +102,9 @@ def prune(
             run says.
         photos: whether to log PSNR in a run's held-out photos; or a folder of photos, with poses in
             ``views``, or near.
+        memory: how much memory may be taken, such as "8GB" or 8000 (units of 10^6 bytes); by
+            default what is free. A PLY that needs more is merged in parts.
+        jobs: number of processes that share these parts, each within ``memory``.
         progress: True shows a bar; a function is called with the current task and the share of it
             that is done.
 
@@ -162,8 +124,28 @@ def prune(
         >>> len(ps.prune(room, keep=1000)), round(len(ps.prune(room, keep="10%", by="coverage")) / len(room), 2)
         (1000, 0.1)
     """
-    request = PruneRequest(keep, by, sh, opacity_weight, clean)
-    return prune_source(scene, request, Looking(views, resolution, up, data, photos), progress)[1]
+    options = PruneOptions(
+        keep=keep,
+        by=by,
+        opacity_weight=opacity_weight,
+        sh=sh,  # type: ignore[arg-type]
+        clean=clean,
+        photos=photos,
+        poses=_named(views),
+        resolution=resolution,
+        up=up,
+        data=data,
+    )
+    done = run.prune(
+        scene,
+        options,
+        views=_given(views),
+        memory=_bytes(memory),
+        jobs=jobs,
+        progress=progress,
+    )
+    log_report(done.report)
+    return done.report.scene
 
 
 def compact(
@@ -231,23 +213,97 @@ def compact(
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
-    on_photos = photos is not False
     format_to_write(target_format)
-    request = CompactRequest.of(
-        refiner,
-        keep,
-        by,
-        sh,
-        clean,
-        RepairBudget(effort, seconds),
-        on_photos,
-        target_format,
-        target_db,
+    options = CompactOptions(
+        keep=keep,
+        by=by or "",
+        sh=sh,  # type: ignore[arg-type]
+        clean=clean,
+        target_format=target_format,
+        effort=effort,
+        seconds=seconds,
+        photos=photos,
+        target_db=target_db,
+        poses=_named(views),
+        resolution=resolution,
+        up=up,
+        data=data,
     )
-    return compact_source(scene, request, Looking(views, resolution, up, data, photos), progress)[1]
+    done = run.compact(scene, options, refiner, views=_given(views), progress=progress)
+    log_report(done.report)
+    return Compacted(**vars(done.report))
+
+
+class Compacted(Report):
+    """The result of :func:`pointsplat_ns.compact`: a smaller scene, and figures of every stage.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> result = ps.compact(ps.example_room()[::10], keep="20%", effort="instant")
+        >>> result.scene is result.pruned, result.accepted
+        (True, False)
+    """
+
+    @property
+    def verdict(self) -> str:
+        """A line of text for each stage after pruning: its gain, or why it is left out. One line if
+        there is no such stage."""
+        return verdict_text(self)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines of text: origin of the views, SH bands dropped, PSNR reached."""
+        return note_lines(self)
+
+
+def clean(
+    scene: Source,
+    strength: float = 0.5,
+    *,
+    picture: str | Path | None = None,
+    views: Views | str | Path | None = None,
+    resolution: tuple[int, int] | str | None = None,
+    up: str | None = None,
+    data: str | Path | None = None,
+    progress: bool | Progress = False,
+) -> Gaussians:
+    """Remove floaters from a scene, and what cannot be drawn or is never visible. No photos are
+    needed.
+
+    Findings (counts, clusters, PSNR without what goes) are logged at level INFO.
+
+    Args:
+        scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
+        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show,
+            without which pictures hardly change. 0 removes none.
+        picture: a PNG file to write: the scene, what goes in a colour for each cluster, and the
+            result.
+        views, resolution, up, data, progress: as for :func:`pointsplat_ns.prune`.
+
+    Returns:
+        The other Gaussians, bit for bit and in order, at least one, on the device of the given
+        scene.
+
+    Raises:
+        SceneError: if no Gaussian can be drawn, or a file is not usable.
+        PointSplatError: if the strength is not in [0, 1].
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()[::10]
+        >>> len(ps.clean(room)) <= len(room)
+        True
+    """
+    options = ViewOptions(poses=_named(views), resolution=resolution, up=up, data=data)
+    done = run.clean(scene, strength, options, views=_given(views), progress=progress)
+    if picture is not None:
+        plot_cleaning(done, picture)
+    log_lines(cleaning_lines(done.cleaning))
+    return done.scene
 
 
 @normal_mode
+@outputs_claimed()
 def lod(
     scene: Source,
     levels: Sequence[Keep | str] | str = ("50%", "25%", "10%", "3%"),
@@ -306,17 +362,22 @@ def lod(
         [(1572, True), (786, True), (100, True)]
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
-    request = PruneRequest(1.0, sh=sh)
+    reduction = PruneOptions(keep=1.0, sh=sh)  # type: ignore[arg-type]
+    reduction.check()
     repair = RepairBudget(effort)
     output = LevelOutput.of(folder, stream, tiles, at, up, force)
     if output is not None:
         output.check(len(budgets))
-    dense, view_source = read_source(scene, Looking(views, resolution, up, data))
+    options = ViewOptions(poses=_named(views), resolution=resolution, up=up, data=data)
+    options.check()
+    subject = read_subject(scene, options, _given(views))
     source = None if isinstance(scene, Gaussians) else source_file(scene)
     with progress_bar(progress) as report:
-        made = make_levels(dense, budgets, request, view_source, source, report, repair)
+        made = make_levels(
+            subject.dense, budgets, reduction, subject.views(), source, report, repair
+        )
         made = made if output is None else output.write(made, report)
-    log(made.notes)
+    log_lines(made.notes)
     return made
 
 
@@ -351,12 +412,24 @@ def plot_views(
         >>> "sampled poses" in text
         True
     """
-    dense, source = read_source(scene, Looking(views, resolution, up, data))
-    return draw_views(dense.detach().to("cpu"), source, path)
+    options = ViewOptions(poses=_named(views), resolution=resolution, up=up, data=data)
+    options.check()
+    subject = read_subject(scene, options, _given(views))
+    return draw_views(subject.dense.detach().to("cpu"), subject.views(), path)
 
 
-def _is_refiner_run(path: str | Path) -> bool:
-    try:
-        return may_be_run(path) and open_run(path, need_data=False).is_refiner
-    except SceneError:
-        return False  # a single scene, or not readable: read_scene raises the error
+def _named(views: Views | str | Path | None) -> str | Path | None:
+    """The path that names views; None if there is none."""
+    return None if isinstance(views, Views) else views
+
+
+def _given(views: Views | str | Path | None) -> Views | None:
+    """Views that are given as such."""
+    return views if isinstance(views, Views) else None
+
+
+def _bytes(memory: float | str | None) -> float | None:
+    """Bytes of a size in units of 10^6 bytes, or in words."""
+    if memory is None:
+        return None
+    return 1e6 * (parse_megabytes(memory) if isinstance(memory, str) else memory)

@@ -1,8 +1,8 @@
 """Errors that a user can act on.
 
-Everything that can be wrong with a file, a folder or a flag raises a subclass of
-:class:`PointSplatError`. Its text is one line that names the file, what was found, what was
-expected and what to do. The command line prints that line and exits with status 1.
+Every fault of a file, a folder or a flag raises a subclass of :class:`PointSplatError`. Its text is
+one line: the path, what was found, what was expected and what to do. The command line prints that
+line and exits with status 1.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Literal
 
 
 def printable(text: str) -> str:
-    r"""Text in one line that cannot steer a terminal: every character that is not printable becomes
-    its escape, as in Python's ``repr``.
+    r"""One line of text that cannot control a terminal: characters that are not printable become
+    escapes, as in Python's ``repr``.
 
     Example:
         >>> print(printable("a name\x1b]0;with orders\x07\n"))
@@ -39,24 +39,20 @@ lightgaussian, pup
     """
 
     def __str__(self) -> str:
-        """The text in one line: what a file put into it can neither break the line nor steer a
-        terminal."""
+        """The text in one line, with control characters escaped."""
         return printable(super().__str__())
 
 
 class SceneError(PointSplatError):
-    """A scene (PLY, checkpoint, run folder or tensors) that cannot be used as it is.
+    """A scene (PLY, checkpoint, run folder or tensors) that cannot be used.
 
     Example:
         >>> import pointsplat_ns as ps
         >>> try:
         ...     ps.load("nowhere.ply")
         ... except ps.SceneError as error:
-        ...     print(error)
-        nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog,
-        lod-meta.json, meta.json, \
-.splat), a checkpoint of Splatfacto or gsplat (.ckpt, .pt), or a Splatfacto run (its folder or
-config.yml)
+        ...     print(f"{str(error)[:58]} ...")
+        nowhere.ply: no such file; expected a scene (.compressed.p ...
     """
 
 
@@ -69,7 +65,7 @@ class DataError(PointSplatError):
         ...     ps.sample_views(ps.example_room()[:0], 12)
         ... except ps.DataError as error:
         ...     print(error)
-        nothing of the scene can be seen, so there is no place to look from
+        nothing of the scene is visible, so no view can be sampled
     """
 
 
@@ -87,7 +83,7 @@ class BudgetError(PointSplatError, ValueError):
 
 
 class MissingPackageError(PointSplatError):
-    """A package that not every installation has, and that what was asked for needs: nerfstudio.
+    """An optional package that a function needs: nerfstudio.
 
     Example:
         >>> raise MissingPackageError("training needs nerfstudio, which is not installed")
@@ -98,15 +94,15 @@ class MissingPackageError(PointSplatError):
 
 
 def need(package: Literal["nerfstudio"], what: str) -> None:
-    """Raise a MissingPackageError, which says ``what`` needs a package, if it cannot be
+    """Raise a MissingPackageError, which says ``what`` needs the package, if it cannot be
     imported."""
     try:
         importlib.import_module(package)
     except ModuleNotFoundError as error:
-        if error.name != package:  # it is there, and something that it needs is not
+        if error.name != package:  # installed, but one of its dependencies is missing
             raise
-        # pip adds what an installed package asks for and lacks.
-        remedy = f"pip install 'pointsplat-ns[{package}]' adds it"
+        # pip also installs missing dependencies.
+        remedy = f"install it with pip install 'pointsplat-ns[{package}]'"
         raise MissingPackageError(
             f"{what} needs {package}, which is not installed; {remedy}"
         ) from None

@@ -14,9 +14,10 @@ import torch
 
 from browser import chromium
 from making import SHARED_DATA, ball, losses_of, small_config
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.views import Views
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.view_sampling.sampler import sample_views
+from quick import quick_settings
 from replica_scenes import write_frames
 
 SEED = 20
@@ -150,14 +151,14 @@ def some_lpips(request, monkeypatch) -> bool:
 def make_refined_run() -> Callable:
     """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved``
     to every opacity logit and nothing else, and gives its folder."""
-    from pointsplat_ns.refiner import Refiner, preset
+    from pointsplat_ns.refinement import Refiner, preset
 
     def make(
         folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model
     ) -> Path:
         config = small_config(data, folder, 10, **model)
         config.pipeline.datamanager.eval_scenes = eval_scenes
-        config.save_config()
+        config.write_config()
         torch.manual_seed(SEED)
         refiner = Refiner(preset("tiny"))
         with torch.no_grad():
@@ -196,7 +197,8 @@ def hollow_ball() -> Gaussians:
 @pytest.fixture(scope="session")
 def ball_views(hollow_ball: Gaussians) -> Views:
     """Four small views from within."""
-    return sample_views(hollow_ball, 4, 64, 48)
+    with quick_settings():
+        return sample_views(hollow_ball, 4, 64, 48)
 
 
 @pytest.fixture(scope="module")
@@ -212,3 +214,17 @@ def signals_as_they_were():
     before = signal.getsignal(signal.SIGTERM)
     yield
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.fixture()
+def time_limit() -> Iterator[None]:
+    """End a test that hangs, as one that waits for a pipe does, after two minutes."""
+
+    def hangs(number, frame):
+        pytest.fail("still running after 120 s")
+
+    before = signal.signal(signal.SIGALRM, hangs)
+    signal.alarm(120)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)

@@ -12,6 +12,8 @@ import pointsplat_ns as ps
 from making import ball, run_of, same
 from pointsplat_ns.cli import main
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.mark.parametrize("name", ps.__all__)
 def test_every_public_name_has_an_example_and_documents_its_arguments(name):

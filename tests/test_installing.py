@@ -128,7 +128,7 @@ def test_command_says_what_it_lacks_in_one_line(outcomes):
     assert (
         done["status"] == 1 and done["err"].startswith("error: ") and done["err"].count("\n") == 1
     )
-    assert said + "pip install 'pointsplat-ns[nerfstudio]' adds it" in done["err"]
+    assert said + "install it with pip install 'pointsplat-ns[nerfstudio]'" in done["err"]
 
 
 def test_requirements_are_what_is_imported():

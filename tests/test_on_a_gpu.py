@@ -9,17 +9,17 @@ import torch
 
 import pointsplat_ns as ps
 from making import box_room, dense_config, same, small_refiner
-from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.comparing.each_view import each_view
-from pointsplat_ns.compression import trained_refiner
-from pointsplat_ns.compression.repair import STEPS
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.looking.settings import changed
-from pointsplat_ns.merging import MERGING, Merger, merge, merge_levels, rounds
-from pointsplat_ns.merging.rounds import one_round
+from pointsplat_ns.pipeline import trained_refiner
+from pointsplat_ns.pipeline.repair_budget import STEPS
+from pointsplat_ns.pruning.merging import MERGING, Merger, merge, merge_levels, rounds
+from pointsplat_ns.pruning.merging.rounds import one_round
 from pointsplat_ns.pruning.methods import METHODS
-from pointsplat_ns.refiner import save_refiner
+from pointsplat_ns.refinement import save_refiner
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
+from pointsplat_ns.rendering.comparison.each_view import each_view
+from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.system.threads import fixed_threads
+from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
 from pretend_gpu import GPU, pretend_gpu
 
 NEAR = 1e-4
@@ -33,7 +33,7 @@ def several_threads():
     from few."""
     with (
         fixed_threads(4),
-        changed({"candidates_per_view": 1, "min_candidates": 4, "evidence_count": 100}),
+        use_settings(replace(SHIPPED, candidates_per_view=1, min_candidates=4, evidence_count=100)),
     ):
         yield
 
@@ -167,7 +167,7 @@ def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(
     monkeypatch.setitem(STEPS, "quick", 3)
     save_refiner(small_refiner(sh_degree=1), tmp_path / "small.safetensors")
     wanted = ps.compact(room, 0.3, views=views)
-    monkeypatch.setattr("pointsplat_ns.compression.requests.default_device", lambda: GPU)
+    monkeypatch.setattr("pointsplat_ns.pipeline.options.default_device", lambda: GPU)
     monkeypatch.setattr(trained_refiner, "default_device", lambda: GPU)
     with pretend_gpu() as gpu:
         found = ps.compact(room, 0.3, views=views)

@@ -88,7 +88,7 @@ def test_wheel_holds_every_file_of_the_packages_but_their_documentation(wheel):
         name for name in tracked_files() if name.startswith(("pointsplat_ns/", "method_configs/"))
     ]
     wanted = {name for name in packaged if not name.endswith((".md", ".svg"))}
-    wanted.add("pointsplat_ns/refiner/pretrained/CARD.md")  # goes with the weights
+    wanted.add("pointsplat_ns/refinement/pretrained/CARD.md")  # goes with the weights
     with zipfile.ZipFile(wheel) as archive:
         held = {info.filename: info.file_size for info in archive.infolist()}
     assert len(wanted) > 100
@@ -113,7 +113,7 @@ def test_wheel_asks_for_nerfstudio_in_an_extra_alone(wheel):
 
 def test_installed_package_has_kernels_and_is_found_by_nerfstudio(installed):
     code = """
-import importlib.metadata, json, pointsplat_ns.rasterizer, pointsplat_ns.system.kernels as kernels
+import importlib.metadata, json, pointsplat_ns.rendering, pointsplat_ns.system.kernels as kernels
 groups = [importlib.metadata.entry_points(group=f"nerfstudio.{kind}_configs") for kind in ("method", "dataparser")]
 names = sorted({point.name for group in groups for point in group})
 print(json.dumps([pointsplat_ns.__file__, kernels.KERNELS.why_missing, names]))

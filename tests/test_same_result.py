@@ -5,11 +5,14 @@ import pytest
 
 import pointsplat_ns as ps
 from making import box_room, same_bits
-from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
+from pointsplat_ns.pipeline.repair import repair
+from pointsplat_ns.pipeline.repair_budget import STEPS, RepairBudget
+from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.threads import fixed_threads
-from pointsplat_ns.view_source import ViewSource
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +40,7 @@ def test_a_scene_is_made_small_to_the_same_bits_on_one_thread_and_on_two(by, roo
 def test_a_repair_has_the_same_bits_on_any_number_of_threads(room, monkeypatch):
     monkeypatch.setitem(STEPS, "quick", 8)
     small = ps.prune(room, 0.3)
-    source = ViewSource(room, given=ps.sample_views(room, 24, 64, 48))
+    source = ViewProvider(room, given=ps.sample_views(room, 24, 64, 48))
     found = []
     for count in (1, 2, 3):
         with fixed_threads(count):

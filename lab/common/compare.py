@@ -8,12 +8,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pointsplat_ns.io import open_run, scene_name
 from pointsplat_ns.metrics import finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
-from pointsplat_ns.tradeoff.measuring import photos_of_one_size
-from pointsplat_ns.views import Views
+from pointsplat_ns.scene.runs import open_run, scene_name
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.tools.tradeoff.measuring import photos_of_one_size
 
 METRICS = ("psnr", "ssim", "lpips")
 

@@ -58,6 +58,20 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(heads), *lines[1:]])
 
 
+def put_between(text: str, new: str, path: Path, name: str) -> str:
+    """A text in which a new part stands between ``<!-- name -->`` and ``<!-- /name -->``.
+
+    Raises:
+        SystemExit: if the text does not have both marks, once each and in order.
+    """
+    first = f"<!-- {name} -->"
+    last = f"<!-- /{name} -->"
+    if text.count(first) != 1 or text.count(last) != 1 or text.index(first) > text.index(last):
+        raise SystemExit(f"{path}: expected {first} and then {last}, once each")
+    before, rest = text.split(first)
+    return f"{before}{first}\n\n{new}\n\n{last}{rest.split(last)[1]}"
+
+
 def number(digits: int, scale: float = 1.0, sign: str = "") -> Callable[[float | None], str]:
     """How a column writes its numbers: digits after the point, a factor first, "+" for a sign
     always, a dash for None.
@@ -83,7 +97,7 @@ megabytes = number(0, 1e-6)
 
 def save_figure(figure: Figure, path: Path, **options: Any) -> None:
     """Write a picture whole or not at all, in the format that its name says."""
-    from pointsplat_ns.io.files import replacing
+    from pointsplat_ns.system.files import replacing
 
     with replacing(path) as part:
         figure.savefig(part, **{"dpi": 110, "format": path.suffix.lstrip(".") or "png", **options})

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from pointsplat_ns.io.files import json_text, replacing
+from pointsplat_ns.system.files import json_text, replacing
 
 Row = dict[str, Any]
 

@@ -6,42 +6,54 @@ from pathlib import Path
 
 import torch
 
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import open_run, scene_name
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.runs import open_run, scene_name
 
 TUNING = (
-    *("apt_bathroom", "bouquet", "pc_flowers", "pc_statue_massa", "plant_pilea", "kettle_pod"),
-    *(
-        "pc_statue_angel",
-        "pc_statue_narcissus",
-        "pc_statue_trumpet",
-        "kitchen",
-        "fox",
-        "final_3dgs",
-        "vr_project",
-    ),
-    *("room", "room5", "meeting", "drone_hall", "figure", "ray", "headquarter_garden"),
+    "apt_bathroom",
+    "bouquet",
+    "pc_flowers",
+    "pc_statue_massa",
+    "plant_pilea",
+    "kettle_pod",
+    "pc_statue_angel",
+    "pc_statue_narcissus",
+    "pc_statue_trumpet",
+    "kitchen",
+    "fox",
+    "final_3dgs",
+    "vr_project",
+    "room",
+    "room5",
+    "meeting",
+    "drone_hall",
+    "figure",
+    "ray",
+    "headquarter_garden",
 )
 """Scenes that constants may be chosen on."""
 
 JUDGED = (
-    *(
-        "apt_kitchen_balcony",
-        "cake_fraisier",
-        "mujoco_tabletop",
-        "pc_playbot",
-        "rock",
-        "pc_statue_angel_kneeling",
-    ),
-    *(
-        "pc_statue_angel_with_candlestick",
-        "pc_statue_st_peter",
-        "lounge",
-        "diorama",
-        "ethiopianHead",
-        "dataset_perso",
-    ),
-    *("lego_dense", "taebak", "office", "room35", "chair", "plant", "phone", "can"),
+    "apt_kitchen_balcony",
+    "cake_fraisier",
+    "mujoco_tabletop",
+    "pc_playbot",
+    "rock",
+    "pc_statue_angel_kneeling",
+    "pc_statue_angel_with_candlestick",
+    "pc_statue_st_peter",
+    "lounge",
+    "diorama",
+    "ethiopianHead",
+    "dataset_perso",
+    "lego_dense",
+    "taebak",
+    "office",
+    "room35",
+    "chair",
+    "plant",
+    "phone",
+    "can",
 )
 """Scenes that no constant is chosen on: they were named before the first measurement. See
 docs/benchmarks.md."""

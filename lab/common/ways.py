@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Literal
 
 from lab.common.programs import ProgramFailed, Usage, run_measured
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_ply
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply import read_ply
 
 Way = Literal["prune", "memory", "compact", "thorough"]
 

@@ -33,11 +33,11 @@ from lab.common.scenes import group_of, room
 from lab.common.ways import count_of
 from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS, DenseViews, JudgedScene, check, check_options, known_rows, load
-from pointsplat_ns.io.files import replacing
-from pointsplat_ns.looking.settings import LOOKING, changed
-from pointsplat_ns.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
+from pointsplat_ns.system.files import replacing
 from pointsplat_ns.system.progress import tracked
+from pointsplat_ns.view_sampling.settings import SHIPPED, use_settings
 
 BASELINE = "default"
 """Name of the settings that all variants are compared with."""
@@ -76,7 +76,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "half_gain_coverage_1": dict(half_gain_coverage=1.0),
 }
 """For each rule the value that turns it off, or a value beside the default: fields of
-:class:`~pointsplat_ns.merging.MergeSettings`."""
+:class:`~pointsplat_ns.pruning.merging.MergeSettings`."""
 
 POSES = "photos, poses given"
 """In place of a width: the poses of held-out photos, where merging is given those of the training
@@ -126,15 +126,15 @@ def settings_of(views: int, width: int) -> dict[str, Any]:
     return (
         {"views": views, "width": width}
         | values
-        | {f"looking.{name}": v for name, v in vars(LOOKING).items()}
+        | {f"looking.{name}": v for name, v in vars(SHIPPED).items()}
     )
 
 
 @contextmanager
 def applied(changes: dict[str, Any]) -> Iterator[MergeSettings]:
     """Settings of merging with changes. Those of looking are changed while the context is open."""
-    looking = {name: value for name, value in changes.items() if name in vars(LOOKING)}
-    with changed(looking):
+    looking = {name: value for name, value in changes.items() if name in vars(SHIPPED)}
+    with use_settings(dataclasses.replace(SHIPPED, **looking)):
         yield dataclasses.replace(
             MERGING, **{name: v for name, v in changes.items() if name not in looking}
         )

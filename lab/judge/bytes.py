@@ -27,8 +27,8 @@ from lab.common.results import Results, Row, grouped
 from lab.common.ways import PEER, SplatTransform, Way, pointsplat_command
 from lab.judge.record import OURS
 from lab.judge.scenes import JudgedScene, check, load, losses
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_scene
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.system.progress import tracked
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.views import Views
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.view_sampling.poses import look_at
 
 FOLDER = Path(__file__).parent / "paths"
 """Where the paths are."""

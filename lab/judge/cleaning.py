@@ -23,11 +23,10 @@ from lab.common.compare import metrics_of, photos_of
 from lab.common.printing import console, number, start, table
 from lab.common.scenes import group_of
 from lab.tables.scenes import Pictures
-from pointsplat_ns.compression.cleaning import floating_scores
-from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.pipeline.cleaning import floating_scores
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
+from pointsplat_ns.rendering import render
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.view_source import VIEW_COUNTS
 
 
 @normal_mode
@@ -59,7 +58,7 @@ def main(
             return {key: [metrics[key] for metrics in found] for key in ("psnr", "ssim")}
 
         before = measured(dense)
-        source = view_source(dense, run=None if sampled else run)
+        source = ViewProvider(dense, run=None if sampled else run)
         scores, _ = floating_scores(dense, source.scored(VIEW_COUNTS.scored))
         rows = []
         for strength in strengths:

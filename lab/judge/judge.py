@@ -35,13 +35,14 @@ from lab.common.ways import WAYS, Reducer, Way, count_of, programs_of
 from lab.judge.camera_paths import path_of, views_of
 from lab.judge.record import Figures, at_order, section
 from lab.judge.scenes import MEASURES, JudgedScene, check, check_options, known_rows, load, losses
-from pointsplat_ns.compression.pictures import plot_views
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.metrics.lpips import Lpips
+from pointsplat_ns.pipeline.view_provider import ViewProvider
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.scene.reading import read_scene
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.view_source import ViewSource
+from pointsplat_ns.tools.comparison_plots import plot_views
 
 Task = tuple[float, Reducer]
 """A share of the Gaussians to keep, and what makes the scene smaller."""
@@ -194,7 +195,7 @@ def write_sheets(scenes: tuple[Path, ...], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for path in scenes:
         scene = read_scene(path)
-        source = ViewSource(scene, views_of(path_of(path.stem), SHEET_WIDTH))
+        source = ViewProvider(scene, views_of(path_of(path.stem), SHEET_WIDTH))
         print(plot_views(scene, source, folder / f"{path.stem}.png"), flush=True)
 
 

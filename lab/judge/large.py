@@ -25,9 +25,10 @@ from lab.common.results import Results, Row, grouped, write_page
 from lab.common.ways import PEER, WAYS, Reducer, Way, programs_of
 from lab.judge.camera_paths import path_of, views_of
 from lab.judge.scenes import DenseViews
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_scene, write_ply
-from pointsplat_ns.io.formats.sog_stream import coarser_levels
+from pointsplat_ns.scene.formats.sog_stream import coarser_levels
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.scene.reading import read_scene
 
 PUBLISHED = "publisher's level"
 """Name of what a stream has."""

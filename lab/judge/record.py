@@ -20,12 +20,12 @@ from typing import Any
 import pandas as pd
 import tyro
 
-from lab.common.printing import markdown, percent
+from lab.common.printing import markdown, percent, put_between
 from lab.common.results import Row, grouped
 from lab.common.scenes import group_of
 from lab.common.ways import PEER
 from lab.judge.scenes import LPIPS_WIDTH, MEASURES, PHOTOS
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.system.files import replacing
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "record"
@@ -41,9 +41,8 @@ DIGITS = {"seconds": 1, "cpu_seconds": 1, "peak_bytes": -6} | {
 }
 """Digits after the point that rows keep: a tenth of what tables show, or finer."""
 
-START = "<!-- judge -->"
-END = "<!-- /judge -->"
-"""What stands around the table in the README."""
+README_TABLE = "judge"
+"""Name of the marks around the table in the README."""
 
 PAGE = """# What smaller scenes lose
 
@@ -364,18 +363,6 @@ def readme_table(rows: list[Row]) -> str:
     )
 
 
-def put_between(text: str, new: str, path: Path) -> str:
-    """A text in which a new part stands between the marks.
-
-    Raises:
-        SystemExit: if the text does not have both marks, once each and in order.
-    """
-    if text.count(START) != 1 or text.count(END) != 1 or text.index(START) > text.index(END):
-        raise SystemExit(f"{path}: expected {START} and then {END}, once each")
-    before, rest = text.split(START)
-    return f"{before}{START}\n\n{new}\n\n{END}{rest.split(END)[1]}"
-
-
 def _count(scenes: str) -> str:
     return f"{scenes} scene{'' if scenes == '1' else 's'}"
 
@@ -401,7 +388,7 @@ def main(
         raise SystemExit(
             f"{', '.join(map(str, files))}: no scene has {', '.join(WAYS)} at one budget"
         )
-    with_table = put_between(readme.read_text("utf-8"), readme_table(rows), readme)
+    with_table = put_between(readme.read_text("utf-8"), readme_table(rows), readme, README_TABLE)
     record.mkdir(parents=True, exist_ok=True)
     for name, photos in (("judge.json", False), ("judge_photos.json", True)):
         if some := [row for row in rows if (row["at"] == PHOTOS) == photos]:

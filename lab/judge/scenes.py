@@ -17,12 +17,12 @@ from lab.common.compare import METRICS, metrics_of, photos_of
 from lab.common.results import Results, Row
 from lab.common.scenes import name_of
 from lab.judge.camera_paths import path_of, views_of
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_scene
 from pointsplat_ns.metrics import finite_psnr
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.rasterizer import render, render_with_alpha
-from pointsplat_ns.views import Views
+from pointsplat_ns.rendering import render, render_with_alpha
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.scene.views import Views
 
 PHOTOS = "photos"
 """In place of a width: the poses of held-out photos, at the photos' own size."""

@@ -21,7 +21,7 @@ from lab.tables.cells import Tables
 from lab.tables.figure import plot_figure
 from lab.tables.layout import Layout, Table, markdown_table
 from lab.tables.ways import WAYS
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.system.files import replacing
 
 SHOWN = (1, 3, 4)
 """Numbers of the tables that are shown: times need an idle machine, and Figure 4 shows its

@@ -37,11 +37,11 @@ from lab.judge.scenes import (
     load,
 )
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import write_ply
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.views import Views
 
 ViewSet = Literal["sampled", "all", "third"]
 """No poses; all training poses; every third of them."""

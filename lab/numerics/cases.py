@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.views import Views
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
 
 WIDTH = 40
 HEIGHT = 32

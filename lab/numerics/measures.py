@@ -14,18 +14,18 @@ from torch import Tensor
 import pointsplat_ns as ps
 from lab.numerics.cases import HEIGHT, WIDTH, Case, Sweep
 from lab.numerics.reference import rasterize_reference
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
-from pointsplat_ns.looking.content import content_size
-from pointsplat_ns.merging import MERGING, merge
-from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.pairs import cheapest_pairs
-from pointsplat_ns.merging.state import Participants, initial_state
+from pointsplat_ns.pruning.merging import MERGING, merge
+from pointsplat_ns.pruning.merging.pair_cost import pair_costs
+from pointsplat_ns.pruning.merging.pairs import cheapest_pairs
+from pointsplat_ns.pruning.merging.state import Participants, initial_state
 from pointsplat_ns.pruning.paper import paper_score
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
-from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.refiner import Refiner
-from pointsplat_ns.refiner.refiner import gaussian_features
+from pointsplat_ns.refinement import Refiner
+from pointsplat_ns.refinement.refiner import gaussian_features
+from pointsplat_ns.rendering import rasterization
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.view_sampling.content import content_size
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 

@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.geometry.transforms import SHORTEST
-from pointsplat_ns.rasterizer.constants import (
+from pointsplat_ns.rendering.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     COMPENSATION_MIN,
     FRUSTUM_MARGIN,
     TRANSMITTANCE_MIN,
 )
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.rendering.spherical_harmonics import sh_basis
+from pointsplat_ns.scene.views import EPS2D
 from pointsplat_ns.system.tensors import FLAGS, FLOATS
-from pointsplat_ns.views import EPS2D
 
 
 def _rotation(quat: Tensor) -> Tensor:

@@ -22,9 +22,9 @@ import torch
 from PIL import Image
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats.sog import encode_sog
-from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.scene.formats.sog import encode_sog
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.reading import read_scene
 
 Read = Callable[[bytes], object]
 """Reads the bytes of one file, or raises."""
@@ -174,8 +174,8 @@ def _with_zeros(header: bytes) -> bytes:
 
 def _refiner_metadata(folder: Path) -> Read:
     """The metadata of a refiner's safetensors file, whose tensors are as they should be."""
-    from pointsplat_ns.compression.trained_refiner import load_refiner
-    from pointsplat_ns.refiner import Refiner, RefinerConfig
+    from pointsplat_ns.pipeline.trained_refiner import load_refiner
+    from pointsplat_ns.refinement import Refiner, RefinerConfig
 
     sizes = {
         "grid": None,
@@ -239,8 +239,8 @@ def _run(folder: Path) -> None:
 def _use_run(path: Path) -> object:
     """What a run's ``config.yml`` says: what the run is, its data, its name, its network if it is a
     refiner's."""
-    from pointsplat_ns.compression.trained_refiner import load_refiner
-    from pointsplat_ns.io.runs import name_of, open_run
+    from pointsplat_ns.pipeline.trained_refiner import load_refiner
+    from pointsplat_ns.scene.runs import name_of, open_run
 
     run = open_run(path.parent, need_data=False)
     for use in (name_of, open_run, lambda place: load_refiner(place, "cpu")):
@@ -289,7 +289,7 @@ def _colmap(suffix: str) -> Callable[[Path], None]:
 
 
 def _poses_in_folder(path: Path) -> object:
-    from pointsplat_ns.io.camera_files import read_named_views
+    from pointsplat_ns.scene.camera_files import read_named_views
 
     return read_named_views(path.parent)
 
@@ -313,12 +313,14 @@ def _use_replica(path: Path) -> object:
 READERS |= {
     "refiner-metadata": _refiner_metadata,
     "weights": at(
-        "a.safetensors", "pointsplat_ns.refiner.feedback:read_feedback_refiner", inside=_with_zeros
+        "a.safetensors",
+        "pointsplat_ns.refinement.feedback:read_feedback_refiner",
+        inside=_with_zeros,
     ),
     "config": at("config.yml", _use_run, _run),
-    "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.io.runs:read_transforms"),
+    "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.scene.runs:read_transforms"),
     "dataset": at("data/transforms.json", _use_dataset, _run),
-    "camera-json": at("a.json", "pointsplat_ns.io.camera_files:read_named_views", _transforms),
+    "camera-json": at("a.json", "pointsplat_ns.scene.camera_files:read_named_views", _transforms),
     "colmap-cameras": at("cameras.bin", _poses_in_folder, _colmap("bin")),
     "colmap-images": at("images.bin", _poses_in_folder, _colmap("bin")),
     "colmap-cameras-text": at("cameras.txt", _poses_in_folder, _colmap("txt")),

@@ -28,7 +28,7 @@ import tyro
 from lab.common.printing import start
 from lab.common.timing import start_of_peak, status_bytes
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.scene.gaussians import Gaussians
 
 CORPUS = Path(__file__).resolve().parents[2] / "tests" / "lab" / "fuzz_corpus"
 

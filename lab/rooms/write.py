@@ -15,7 +15,7 @@ from torch import Tensor
 from lab.rooms.render import default_intrinsics, render_room
 from lab.rooms.room import Room, make_room
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import read_text
+from pointsplat_ns.system.files import read_text
 from pointsplat_ns.system.progress import Progress, tracked
 
 

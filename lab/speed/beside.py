@@ -20,7 +20,7 @@ import tyro
 from lab.common.printing import markdown, start
 from lab.common.results import Results, Row, grouped, write_page
 from lab.common.ways import count_of, programs_of
-from pointsplat_ns.io.ply import PlyRows
+from pointsplat_ns.scene.ply import PlyRows
 
 OURS = "prune"
 

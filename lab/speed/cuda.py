@@ -34,8 +34,8 @@ from lab.common.printing import start
 from lab.common.timing import seconds_of
 from lab.rooms import write_room
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.rendering import gsplat_works
+from pointsplat_ns.rendering import rasterization
+from pointsplat_ns.rendering.rasterization import gsplat_works
 from pointsplat_ns.system.threads import now
 
 SUPPORT = Path(__file__).parents[2] / "tests" / "support"
@@ -99,9 +99,7 @@ def compacted(scene: ps.Gaussians, device: torch.device, resolution: tuple[int, 
     """The same of a compact scene. What draws is the default device, which is changed."""
     found = []
     for each in (torch.device("cpu"), device):
-        with mock.patch(
-            "pointsplat_ns.compression.requests.default_device", lambda each=each: each
-        ):
+        with mock.patch("pointsplat_ns.pipeline.options.default_device", lambda each=each: each):
             result = ps.compact(scene, 0.1, resolution=resolution)
         found.append((len(result.scene), result.stages[-1].after.psnr))
     return compared(found)

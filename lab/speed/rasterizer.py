@@ -24,12 +24,12 @@ from lab.common.scenes import room
 from lab.common.timing import now, timed, use_cpu_time
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.metrics import psnr
-from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.blending import blend
-from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
-from pointsplat_ns.rasterizer.projection import camera_of, project
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
-from pointsplat_ns.rasterizer.tiles import Footprints
+from pointsplat_ns.rendering import rasterization
+from pointsplat_ns.rendering.blending import blend
+from pointsplat_ns.rendering.pixel_walk import sum_over_pixels
+from pointsplat_ns.rendering.projection import camera_of, project
+from pointsplat_ns.rendering.spherical_harmonics import sh_to_color
+from pointsplat_ns.rendering.tiles import Footprints
 from pointsplat_ns.system.threads import one_thread
 
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -24,10 +24,10 @@ from torch.profiler import ProfilerActivity, profile
 
 import pointsplat_ns as ps
 from lab.common.printing import markdown, percent, start
-from pointsplat_ns.io import open_run
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import dataparser_of
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
+from pointsplat_ns.scene.runs import open_run
 
 DRAWING = {
     "blending": ("Blend",),

@@ -11,8 +11,8 @@ import torch
 from lab.common.printing import save_figure
 from lab.common.results import Row
 from lab.tables.ways import PROTOCOL, WAYS, cell_key
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.paper import log_volume
+from pointsplat_ns.scene.gaussians import Gaussians
 
 OPACITY_EDGES = np.linspace(0.0, 1.0, 41)
 """Edges of the bins of opacity."""

@@ -20,9 +20,9 @@ from lab.tables.making import Maker, Refiners, Tools
 from lab.tables.scenes import Options, open_scene
 from lab.tables.ways import PROTOCOL, WAYS
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import name_of
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.rendering import render
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.runs import name_of
 
 FEW = PROTOCOL.ablation_share
 HALF = PROTOCOL.figure_share

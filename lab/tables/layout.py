@@ -17,7 +17,7 @@ from lab.common.results import Row
 from lab.tables.cells import FILES, Tables
 from lab.tables.figure import medians, plot_figure, share_of_figure
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
-from pointsplat_ns.io.files import replacing, three_digits
+from pointsplat_ns.system.files import replacing, three_digits
 
 READING = (
     "Figures are means over the same scenes in all rows of a table, but for rows with a mark. "

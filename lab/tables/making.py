@@ -22,17 +22,17 @@ import pointsplat_ns as ps
 from lab.common.ways import SplatTransform
 from lab.tables.scenes import OpenedScene, Options
 from lab.tables.ways import PROTOCOL, WAYS, Network, Way
-from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, optimised
-from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.io.runs import RUN_FILES
-from pointsplat_ns.io.scene import source_file
-from pointsplat_ns.photos.examples import Example
+from pointsplat_ns.pipeline.optimiser import RATES, Adam, AdamSettings, optimised
+from pointsplat_ns.pipeline.photos.examples import Example
+from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.pruning import method_named, resolve_keep, score_of, select
 from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.refiner import read_metadata
+from pointsplat_ns.refinement import read_metadata
+from pointsplat_ns.rendering import render
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.scene.reading import source_file
+from pointsplat_ns.scene.runs import RUN_FILES
 
 
 class Tools:

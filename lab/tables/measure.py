@@ -26,18 +26,18 @@ from lab.tables.layout import write_tables
 from lab.tables.making import Maker, Refiners, Tools
 from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
-from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import logger, need_folder
-from pointsplat_ns.io.runs import may_be_run, name_of, open_run
-from pointsplat_ns.io.scene import source_file
 from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.reading import source_file
+from pointsplat_ns.scene.runs import may_be_run, name_of, open_run
+from pointsplat_ns.scene.views import View
+from pointsplat_ns.system.files import logger, need_folder
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.tradeoff.measuring import machine_text
-from pointsplat_ns.views import View
+from pointsplat_ns.tools.tradeoff.measuring import machine_text
 
 ROUNDS = 3
 """Number of timed frames of each view; the fastest counts."""

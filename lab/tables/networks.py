@@ -23,7 +23,7 @@ from lab.common.printing import start
 from lab.common.running import folder_of_run, run, train_refiner_command
 from lab.tables.ways import PROTOCOL, WAYS, Way
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.io.runs import METHOD_NAMES, RUN_FILES, open_run
+from pointsplat_ns.scene.runs import METHOD_NAMES, RUN_FILES, open_run
 
 
 @dataclass(frozen=True)

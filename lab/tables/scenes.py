@@ -13,14 +13,14 @@ import pointsplat_ns as ps
 from lab.common.compare import dataset_photos
 from lab.tables.ways import PROTOCOL
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import logger
-from pointsplat_ns.io.runs import Run, may_be_run, open_run
-from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.pruning import need_usable
-from pointsplat_ns.views import Views
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.scene.runs import Run, may_be_run, open_run
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.files import logger
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,12 @@ import tyro
 
 import pointsplat_ns as ps
 from lab.common.printing import start
-from pointsplat_ns.compacting import Looking, read_source
-from pointsplat_ns.compression.photo_repair import photo_repair
-from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.requests import PhotoBudget, PruneRequest
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
+from pointsplat_ns.pipeline.options import PruneOptions, ViewOptions
+from pointsplat_ns.pipeline.photo_repair import photo_repair
+from pointsplat_ns.pipeline.prune_scene import prune_scene
+from pointsplat_ns.pipeline.repair_budget import PhotoBudget
+from pointsplat_ns.pipeline.subject import read_subject
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,10 @@ def main(
         keep: number of Gaussians.
         output: the PLY to write.
     """
-    dense, views = read_source(run, Looking())
-    pruned = prune_scene(dense, PruneRequest(keep, by), views).scene
+    subject = read_subject(run, ViewOptions())
+    dense = subject.dense
+    views = subject.views()
+    pruned = prune_scene(dense, PruneOptions(keep, by), views).scene
     budget = CpuBudget(cpu_seconds=seconds, started=time.process_time())
     trained = photo_repair(pruned, dense, run_photos(run), views, budget)
     print(

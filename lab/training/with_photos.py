@@ -35,12 +35,12 @@ from lab.common.running import folder_of_run
 from lab.common.ways import count_of
 from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS
-from pointsplat_ns.compression.requests import PHOTO_STEPS
-from pointsplat_ns.io import read_scene
-from pointsplat_ns.io.files import replacing
-from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.pipeline.repair_budget import PHOTO_STEPS
+from pointsplat_ns.rendering import render
+from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.scene.runs import METHOD_NAMES
+from pointsplat_ns.system.files import replacing
 
 DENSE = "dense"
 """Name of the dense scene."""

@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO, cast
 
 from pointsplat_ns.errors import PointSplatError, printable
+from pointsplat_ns.system.terminal import say
 
 COMMANDS = (
     "prune",
@@ -39,12 +40,21 @@ runs."""
 
 class _Shown:
     """A text stream that shows control characters, such as those in the name of a file, instead of
-    sending them."""
+    sending them. Colours and the moves of progress bars are sent, unless it is ``plain``; then it
+    is no terminal to libraries, and gets none."""
 
-    def __init__(self, stream: TextIO):
+    def __init__(self, stream: TextIO, plain: bool = False):
         self._stream = stream
+        self._plain = plain
+
+    def isatty(self) -> bool:
+        return not self._plain and self._stream.isatty()
 
     def write(self, text: str) -> int:
+        if self._plain:
+            lines = text.split("\n")
+            self._stream.write("\n".join(map(printable, lines)))
+            return len(text)
         # Colours and the moves of progress bars, which are ours; then any other control characters,
         # which are not.
         steering = r"\x1b\[(?:[\d;]*m|\?25[lh]|\d*[AK])|[^\t\n\r\x20-\x7e\xa0-\U0010ffff]+"
@@ -58,12 +68,12 @@ class _Shown:
 
 
 @contextmanager
-def any_text_printable() -> Iterator[None]:
+def any_text_printable(plain: bool = False) -> Iterator[None]:
     """Let standard output and standard error take any text while the context is open.
 
     Streams that are closed go nowhere. Characters that an encoding lacks are replaced. Control
     characters are shown as Python writes them, such as ``\\x1b``; only colours and progress bars
-    reach a terminal.
+    reach a terminal, and not these if ``plain``.
     """
     for number in (0, 1, 2):
         try:
@@ -75,7 +85,7 @@ def any_text_printable() -> Iterator[None]:
     errors = out.errors
     if isinstance(out, io.TextIOWrapper):
         out.reconfigure(errors="replace")
-    sys.stdout, sys.stderr = (cast(TextIO, _Shown(stream)) for stream in (out, err))
+    sys.stdout, sys.stderr = (cast(TextIO, _Shown(stream, plain)) for stream in (out, err))
     try:
         yield
     finally:
@@ -89,7 +99,7 @@ class _PrintHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         is_warning = record.levelno >= logging.WARNING
-        print(printable(self.format(record)), file=sys.stderr if is_warning else sys.stdout)
+        say(self.format(record), error=is_warning)
 
 
 @contextmanager
@@ -139,7 +149,7 @@ def _what_failed(error: Exception) -> str:
         return f"{error.name} is not installed; pip install pointsplat-ns adds what is missing"
     if isinstance(error, ImportError):
         return f"{error}; torch takes 4 GB of address space (ulimit -v)"
-    from pointsplat_ns.io.files import one_line  # which imports torch
+    from pointsplat_ns.system.files import one_line  # which imports torch
 
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
@@ -218,9 +228,10 @@ def main(args: list[str] | None = None) -> None:
     it with one line and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its
     number. With ``--json``, standard output has one JSON value and nothing else.
     """
-    with any_text_printable():
+    args = sys.argv[1:] if args is None else args
+    with any_text_printable(plain=not all(map(str.isprintable, args))):  # what tyro prints of them
         try:
-            _run(sys.argv[1:] if args is None else args)
+            _run(args)
         except PointSplatError as error:
             text = f"error: {error}"
             status = 1
@@ -239,7 +250,7 @@ def main(args: list[str] | None = None) -> None:
             status = 130
         else:
             return
-        print(text, file=sys.stderr)
+        say(text, error=True)
         sys.exit(status)
 
 
@@ -253,13 +264,20 @@ def _run(args: list[str]) -> None:
         from pointsplat_ns.cli.printing import only_json
         from pointsplat_ns.cli.scene_options import quantities
         from pointsplat_ns.system.memory import keep_freed_memory
+        from pointsplat_ns.system.outputs import outputs_claimed
 
         keep_freed_memory()
         _ignore_matplotlibrc()
         level = logging.DEBUG if "--verbose" in args else logging.INFO
-        with _log_printed(level), _ended_by_signals(), only_json(args), quantities():
+        with (
+            _log_printed(level),
+            _ended_by_signals(),
+            outputs_claimed(),
+            only_json(args),
+            quantities(),
+        ):
             if args == ["--version"]:
-                print(f"pointsplat-ns {__version__}")
+                say(f"pointsplat-ns {__version__}")
             elif args and args[0] in COMMANDS:
                 tyro.cli(_command(args[0]), prog=f"pointsplat {args[0]}", args=args[1:])
             else:
@@ -273,7 +291,7 @@ def _run(args: list[str]) -> None:
                 )
     except SystemExit as end:
         if not end.code and (text := after_help(args)):
-            print(f"\n{text}")
+            say("", *text.splitlines())
         raise
     finally:
         sys.stdout.flush()  # a full disk or a closed pipe is noticed here

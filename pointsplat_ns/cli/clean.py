@@ -6,21 +6,20 @@ from pathlib import Path
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, print_result, scene_result
+from pointsplat_ns.pipeline.options import ViewOptions
+from pointsplat_ns.system.terminal import say
 
 
 def clean(
     scene: options.Scene,
+    views: options.Flat[ViewOptions],
     output: options.Output = None,
     strength: float = 0.5,
     picture: Path | None = None,
-    poses: options.Poses = None,
-    resolution: options.Resolution = None,
-    up: options.Up = None,
-    data: options.Data = None,
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Remove floaters, and what cannot be drawn or is seen from nowhere.
+    """Remove floaters, and what cannot be drawn or is never visible.
 
     Args:
         output: file to write: .ply, .spz, .sog, .splat; by default in the format of the scene and
@@ -32,23 +31,26 @@ def clean(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.compacting import Looking, clean_source
-    from pointsplat_ns.compression.quality import judge_of, quality_of_file
+    from pointsplat_ns.pipeline import run
+    from pointsplat_ns.pipeline.quality import judge_of, quality_of_file
+    from pointsplat_ns.tools.comparison_plots import plot_cleaning
+    from pointsplat_ns.tools.wording import cleaning_lines, log_lines, quality_json
 
     options.need_one_scene(scene)
-    options.check_poses(poses)
+    options.check_poses(views.poses)
     output = output or options.output_beside(scene, "clean")
     options.check_outputs(output, force, picture)
-    looking = Looking(poses, resolution, up, data)
-    dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)
-    ps.save(cleaned, output, progress=True, overwrite=True)
-    quality = quality_of_file(judge_of(dense, source), cleaned, output)
-    if json_output:
-        compared = quality.as_dict() if quality else {"psnr": None}
-        print_json(
-            {**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture}
-        )
-        return
-    print_result("clean", [], len(dense), cleaned, seconds, output, quality)
+    done = run.clean(scene, strength, views, progress=True)
     if picture is not None:
-        print(f"{picture}: the scene, what goes, and the result, side by side")
+        plot_cleaning(done, picture)
+    log_lines(cleaning_lines(done.cleaning))
+    ps.save(done.scene, output, progress=True, overwrite=True)
+    quality = quality_of_file(judge_of(done.dense, done.views), done.scene, output)
+    before = len(done.dense)
+    if json_output:
+        result = scene_result(before, done.scene, done.seconds, output)
+        print_json({**result, **quality_json(quality), "picture": picture})
+        return
+    print_result("clean", [], before, done.scene, done.seconds, output, quality)
+    if picture is not None:
+        say(f"{picture}: the scene, what goes, and the result, side by side")

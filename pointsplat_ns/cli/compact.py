@@ -19,10 +19,13 @@ from pointsplat_ns.cli.printing import (
     scene_result,
     written_size,
 )
+from pointsplat_ns.pipeline.options import CompactOptions
+from pointsplat_ns.system.terminal import say
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.quality import Quality
-    from pointsplat_ns.folders import SceneResult
+    from pointsplat_ns.pipeline.quality import Quality
+    from pointsplat_ns.pipeline.report import Report
+    from pointsplat_ns.tools.folders import SceneResult
 
 GoalName = Literal["web", "phone", "headset", "email"]
 
@@ -61,21 +64,9 @@ GOALS: dict[GoalName | None, Goal] = {
 
 def compact(
     scene: options.Scenes,
+    how: options.Flat[CompactOptions],
     output: options.Output = None,
     goal: Annotated[GoalName | None, tyro.conf.arg(name="for")] = None,
-    keep: str | None = None,
-    refiner: Path | None = None,
-    by: str | None = None,
-    sh: options.Bands = "all",
-    clean: bool = False,
-    effort: Literal["instant", "quick", "thorough"] = "quick",
-    seconds: float | None = None,
-    photos: options.Photos = False,
-    target_db: float | None = None,
-    poses: options.Poses = None,
-    resolution: options.Resolution = None,
-    up: options.Up = None,
-    data: options.Data = None,
     picture: Path | None = None,
     html: Path | None = None,
     force: options.Force = False,
@@ -103,25 +94,6 @@ def compact(
             the scene to paste into another), phone (a .sog of at most 500,000 Gaussians), headset
             (an .spz of at most 400,000), email (an .spz of 5 MB, and a page that opens with a
             double click). --keep, --target-db and --html replace its parts.
-        keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached
-            before repairs. With --photos, auto is the smallest file that loses at most 0.3 dB in
-            held-out photos. By default the budget of the refiner's training; without a refiner 0.1.
-        refiner: a trained network that refines the scene before the steps: a pointsplat run (its
-            folder or config.yml), a .safetensors file, or shipped; by default none.
-        by: the method of prune; by default the method of the refiner's training; without a refiner
-            merge.
-        sh: SH bands to keep, as for prune: all, up to a degree, or auto.
-        clean: as for prune: first remove Gaussians that cannot be drawn or seen.
-        effort: length of the repair: no steps (instant), 192 (quick), or 1200 (thorough); up to
-            four times as many for more than 20,000 Gaussians.
-        seconds: duration of the repair, in place of --effort; by default none is set. Ctrl-C ends
-            it earlier and writes the scene so far.
-        photos: in place of the repair train on photos, by 2400 steps (quick) or 12000 (thorough),
-            or for --seconds. Photos in and outside of the steps say whether it helped. For a run,
-            those of its dataset; for any scene, those in FOLDER, with the poses of --poses, or of a
-            file of cameras there, above it or beside the scene.
-        target_db: in place of --keep, the smallest file that has at least this PSNR against renders
-            of the dense scene, after all repairs; by default none is searched for.
         picture: a .png file for images of some views: dense, before and after the repair, side by
             side; for a folder, all scenes before and after; by default none.
         html: an .html file that opens offline in a browser, to fly through the scene before and
@@ -130,122 +102,172 @@ def compact(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.io.scene import is_folder_of_scenes
+    from pointsplat_ns.scene.reading import is_folder_of_scenes
 
-    chosen = GOALS[goal]
-    unasked = goal is None and keep is None and refiner is None and target_db is None
-    keep = chosen.keep if keep is None and target_db is None else keep
+    purpose = GOALS[goal]
+    unasked = goal is None and how.keep is None and how.refiner is None and how.target_db is None
+    if how.keep is None and how.target_db is None:
+        how = replace(how, keep=purpose.keep)
     if is_folder_of_scenes(scene):
-        from pointsplat_ns.folders import output_folder
-
-        for name, given in {"--poses": poses, "--up": up, "--photos": photos}.items():
-            if given is not None and given is not False:
-                raise ps.SceneError(f"{name} is for one scene; {scene} is a folder of scenes")
-        folder = output or output_folder(scene)
-        results = ps.compact_folder(
-            scene,
-            folder,
-            keep,
-            refiner,
-            by=by,
-            sh=sh,
-            clean=clean,
-            effort=effort,
-            seconds=seconds,
-            target_db=target_db,
-            resolution=resolution,
-            data=data,
-            target_format=chosen.suffix,
-            html=html,
-            picture=picture,
-            jobs=1 if jobs is None else jobs,
-            force=force,
-            progress=True,
-        )
-        return _print_folder(
-            results, folder, [path for path in (html, picture) if path is not None], json_output
-        )
+        return _compact_folder(scene, how, output, purpose, picture, html, force, jobs, json_output)
     if jobs is not None:
         raise ps.SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
-    from pointsplat_ns.compacting import Looking, compact_source
-    from pointsplat_ns.compression.quality import judge_of, quality_of_file
-    from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
-    from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.io.runs import name_of
+    from pointsplat_ns.pipeline import run
+    from pointsplat_ns.pipeline.quality import quality_of_file
+    from pointsplat_ns.scene.formats import format_to_write
+    from pointsplat_ns.system.outputs import remove_own, unnamed
+    from pointsplat_ns.tools.wording import log_report, quality_details
 
-    options.check_poses(poses)
+    options.check_poses(how.poses)
     if (
         output is not None
-        and chosen.suffix is not None
-        and not output.name.lower().endswith(chosen.suffix)
+        and purpose.suffix is not None
+        and not output.name.lower().endswith(purpose.suffix)
     ):
         raise ps.SceneError(
-            f"{output}: --for {goal} writes {chosen.suffix}; expected such a name, or --keep in "
+            f"{output}: --for {goal} writes {purpose.suffix}; expected such a name, or --keep in "
             "place of --for"
         )
-    output = output or options.output_beside(scene, goal or "compact", chosen.suffix)
-    alone = chosen.page and html is None
-    html = output.with_suffix(".html") if alone else html
+    output = output or options.output_beside(scene, goal or "compact", purpose.suffix)
+    alone = purpose.page and html is None
+    html = unnamed(output.with_suffix(".html")) if alone else html
     options.check_outputs(output, force, picture, html)
-    budget = RepairBudget(effort, seconds)
-    suffix = format_to_write(output).suffix
-    trained = None if refiner is None else ps.load_refiner(refiner, by=by)
-    request = CompactRequest.of(
-        trained, keep, by, sh, clean, budget, bool(photos), suffix, target_db
-    )
-    unfinished = output.with_name(f".{output.name}.unfinished")
-    request = replace(request, unfinished=unfinished)
-    looking = Looking(poses, resolution, up, data, photos)
-    dense, result, source = compact_source(scene, request, looking, progress=True)
-    ps.save(result.scene, output, progress=True, overwrite=True)
-    unfinished.unlink(missing_ok=True)
-    quality = quality_of_file(result.judge or judge_of(dense, source), result.scene, output)
+    refiner = None if how.refiner is None else ps.load_refiner(how.refiner, by=how.by or None)
+    how = replace(how, target_format=format_to_write(output).suffix)
+    state_file = output.with_name(f".{output.name}.unfinished")
+    done = run.compact(scene, how, refiner, state_file=state_file, progress=True)
+    log_report(done.report)
+    report = done.report
+    ps.save(report.scene, output, progress=True, overwrite=True)
+    remove_own(state_file)
+    quality = quality_of_file(done.judge, report.scene, output)
     if quality is not None:
-        quality = replace(quality, photos=result.photo_gain)
+        quality = replace(quality, photos=report.photo_gain)
     files = [_file_text(scene), _file_text(output)]
-    shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
+    shown = None
+    if picture is not None:
+        assert report.dense is not None
+        shown = ps.plot_comparison(report.dense, report, picture, files, quality)
     if html is not None:
-        names = None if alone else [f"dense ({files[0]})", f"compact ({files[1]})"]
-        notes = [] if alone or quality is None else [f"{quality}"]
-        sampled = any(
-            note.startswith("views: sampled") for note in result.notes
-        )  # the page opens better without these
-        ps.write_page(
-            [dense, result.scene][alone:],
-            html,
-            names,
-            title=name_of(scene),
-            notes=notes,
-            views=None if sampled else result.views,
-            up=up,
-            limit_mb=chosen.page_mb,
-            progress=True,
-        )
+        _write_page(scene, report, html, files, quality, alone, how.up, purpose.page_mb)
     if json_output:
-        made = {
-            "refined": result.accepted,
-            "repaired": result.repair_accepted,
-            **(quality.as_dict() if quality else {"psnr": None}),
-            "picture": picture,
-            "html": html,
-        }
-        print_json({**scene_result(len(dense), result.scene, result.seconds, output), **made})
+        _print_json(report, output, quality, picture, html)
     else:
-        also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
-        also += ["trained on photos"] * (result.last.photos is not None)
-        print_result(
-            request.prune.by, also, len(dense), result.scene, result.seconds, output, quality
-        )
+        _print_result(report, output, quality)
         print_if_larger(scene, output)
         if verbose and quality is not None:
-            print(quality.details)
+            say(quality_details(quality))
         if shown is not None:
-            print(shown)
-        _print_use(goal, html, name_of(scene), quality)
-    if result.interrupted:
+            say(shown)
+        _print_use(goal, html, scene, quality)
+    if report.interrupted:
         raise KeyboardInterrupt  # once the best result so far is written and printed
     if unasked and not json_output:
         _print_next(scene, output, quality)
+
+
+def _compact_folder(
+    scene: Path,
+    how: CompactOptions,
+    output: Path | None,
+    purpose: Goal,
+    picture: Path | None,
+    html: Path | None,
+    force: bool,
+    jobs: int | None,
+    json_output: bool,
+) -> None:
+    """Compact all scenes of a folder, and print a table of the results."""
+    import pointsplat_ns as ps
+    from pointsplat_ns.tools.folders import output_folder
+
+    for name, given in {"--poses": how.poses, "--up": how.up, "--photos": how.photos}.items():
+        if given is not None and given is not False:
+            raise ps.SceneError(f"{name} is for one scene; {scene} is a folder of scenes")
+    folder = output or output_folder(scene)
+    results = ps.compact_folder(
+        scene,
+        folder,
+        how.keep,
+        how.refiner,
+        by=how.by,
+        opacity_weight=how.opacity_weight,
+        sh=how.sh,
+        clean=how.clean,
+        effort=how.effort,
+        seconds=how.seconds,
+        target_db=how.target_db,
+        resolution=how.resolution,
+        data=how.data,
+        target_format=purpose.suffix,
+        html=html,
+        picture=picture,
+        jobs=1 if jobs is None else jobs,
+        force=force,
+        progress=True,
+    )
+    _print_folder(results, folder, [path for path in (html, picture) if path], json_output)
+
+
+def _write_page(
+    scene: Path,
+    report: Report,
+    html: Path,
+    files: list[str],
+    quality: Quality | None,
+    alone: bool,
+    up: str | None,
+    limit_mb: float,
+) -> None:
+    """Write the page to fly through a result, beside the dense scene unless it stands ``alone``."""
+    import pointsplat_ns as ps
+    from pointsplat_ns.pipeline.view_provider import Origin
+    from pointsplat_ns.scene.runs import name_of
+    from pointsplat_ns.tools.wording import quality_text
+
+    assert report.dense is not None
+    sampled = report.origin is not None and report.origin.kind is Origin.SAMPLED
+    ps.write_page(
+        [report.scene] if alone else [report.dense, report.scene],
+        html,
+        None if alone else [f"dense ({files[0]})", f"compact ({files[1]})"],
+        title=name_of(scene),
+        notes=[] if alone or quality is None else [quality_text(quality)],
+        views=None if sampled else report.views,  # the page opens better without sampled ones
+        up=up,
+        limit_mb=limit_mb,
+        progress=True,
+    )
+
+
+def _print_json(
+    report: Report, output: Path, quality: Quality | None, picture: Path | None, html: Path | None
+) -> None:
+    from pointsplat_ns.tools.wording import quality_json
+
+    print_json(
+        {
+            **scene_result(report.count_before, report.scene, report.seconds, output),
+            "refined": report.accepted,
+            "repaired": report.repair_accepted,
+            **quality_json(quality),
+            "picture": picture,
+            "html": html,
+        }
+    )
+
+
+def _print_result(report: Report, output: Path, quality: Quality | None) -> None:
+    also = []
+    if report.accepted:
+        also.append("refined")
+    if report.repair_accepted:
+        also.append("repaired")
+    if report.last.photos is not None:
+        also.append("trained on photos")
+    print_result(
+        report.by, also, report.count_before, report.scene, report.seconds, output, quality
+    )
 
 
 def _print_folder(
@@ -254,7 +276,7 @@ def _print_folder(
     """Print a table of the scenes of a folder, or JSON. Raises PointSplatError if one has
     failed."""
     from pointsplat_ns.errors import PointSplatError
-    from pointsplat_ns.io.discovery import FOLDER_FILES
+    from pointsplat_ns.scene.discovery import FOLDER_FILES
     from pointsplat_ns.system.terminal import print_table
 
     failed = sum(result.status == "failed" for result in results)
@@ -275,12 +297,12 @@ def _print_folder(
             )
         header = ("scene", "before", "after", "MB", "dB", "seconds", "status")
         print_table(header, rows, "dB: PSNR against the scene's own renders", left=(0, 6))
-        print(
+        say(
             f"{folder}: {len(results) - failed} of {len(results)} scenes, and the table "
             f"{FOLDER_FILES.scenes_table}"
         )
         for path in shown:
-            print(f"{path}: all scenes before and after")
+            say(f"{path}: all scenes before and after")
     if failed:
         raise PointSplatError(
             f"{failed} of {len(results)} scenes failed; the same command tries them again"
@@ -289,8 +311,8 @@ def _print_folder(
 
 def _file_text(path: Path) -> str:
     """Name and size of a scene's file or SOG folder; the name alone of a run."""
-    from pointsplat_ns.io.formats import SOG_META
-    from pointsplat_ns.io.runs import name_of
+    from pointsplat_ns.scene.formats import SOG_META
+    from pointsplat_ns.scene.runs import name_of
 
     file = path / SOG_META if path.is_dir() else path
     return (
@@ -301,16 +323,17 @@ def _file_text(path: Path) -> str:
 
 
 def _print_use(
-    goal: GoalName | None, page: Path | None, name: str, quality: Quality | None
+    goal: GoalName | None, page: Path | None, scene: Path, quality: Quality | None
 ) -> None:
-    """Print what a page of the scene called ``name`` is for; for a headset, also the fill, which
-    can slow it."""
+    """Print what a page of a scene is for; for a headset, also the fill, which can slow it."""
+    from pointsplat_ns.scene.runs import name_of
+
     if page is not None:
-        use = GOALS[goal].use.format(url=quote(page.name), name=escape(name))
-        print(f"{page}: {written_size(page)}, {use}")
+        use = GOALS[goal].use.format(url=quote(page.name), name=escape(name_of(scene)))
+        say(f"{page}: {written_size(page)}, {use}")
     if goal == "headset" and quality is not None:
         fill = f"{quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
-        print(f"fill: {fill}; where it is too slow near things, a smaller --keep lowers it")
+        say(f"fill: {fill}; where it is too slow near things, a smaller --keep lowers it")
 
 
 def _print_next(scene: Path, output: Path, quality: Quality | None) -> None:
@@ -332,4 +355,5 @@ def _print_next(scene: Path, output: Path, quality: Quality | None) -> None:
         ["pointsplat", "view", str(scene), str(output)],
         ["pointsplat", "compact", str(scene), *other],
     )
-    print("next: " + "\n      ".join(map(shlex.join, commands)))
+    first, *others = map(shlex.join, commands)
+    say(f"next: {first}", *(f"      {other}" for other in others))

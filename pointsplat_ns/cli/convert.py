@@ -11,6 +11,7 @@ import tyro
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, scene_result, written_size
 from pointsplat_ns.system.quantities import seconds_text
+from pointsplat_ns.system.terminal import say
 
 
 def convert(
@@ -41,9 +42,9 @@ def convert(
     from pointsplat_ns.pruning import cut_sh
 
     options.need_one_scene(scene)
+    there = output.parent.exists()
     options.check_outputs(output, force)
     start = time.perf_counter()
-    there = output.parent.exists()
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))
     after = ps.place(after, up, scale, scene if original_frame else None)
@@ -55,7 +56,7 @@ def convert(
     cut = f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
     degree = f"SH degree {before.sh_degree}{cut}"
     made = "" if there else ", in a new folder"
-    print(
+    say(
         f"{output}: {len(after):,} Gaussians, {degree}, {written_size(output)}, in "
         f"{seconds_text(seconds)}{made}"
     )

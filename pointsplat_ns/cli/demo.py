@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import written_size
+from pointsplat_ns.system.terminal import say
 
 
 def demo(output: options.Output = None, force: options.Force = False) -> None:
@@ -15,9 +16,10 @@ def demo(output: options.Output = None, force: options.Force = False) -> None:
         output: the file to write, of any format as for prune; by default room.ply in this folder.
     """
     import pointsplat_ns as ps
+    from pointsplat_ns.system.outputs import unnamed
 
-    path = output or Path("room.ply")
+    path = output or unnamed(Path("room.ply"))
     scene = ps.example_room()
     options.check_outputs(path, force)
     ps.save(scene, path, overwrite=True)
-    print(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")
+    say(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")

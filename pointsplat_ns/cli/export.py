@@ -11,6 +11,7 @@ import tyro
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, scene_result, written_size
 from pointsplat_ns.system.quantities import seconds_text
+from pointsplat_ns.system.terminal import say
 
 
 def export(
@@ -43,6 +44,6 @@ def export(
     if json_output:
         print_json(scene_result(None, exported, seconds, output))
         return
-    print(
+    say(
         f"{output}: {len(exported):,} Gaussians, {written_size(output)}, in {seconds_text(seconds)}"
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,9 +10,10 @@ import tyro
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json
+from pointsplat_ns.system.terminal import say
 
 if TYPE_CHECKING:
-    from pointsplat_ns.scene_info import SceneInfo
+    from pointsplat_ns.tools.scene_info import SceneInfo
 
 
 def info(
@@ -55,7 +55,7 @@ def info(
         except PointSplatError as error:
             if len(scenes) == 1:
                 raise
-            print(f"error: {error}", file=sys.stderr)
+            say(f"error: {error}", error=True)
             failed.append({"file": str(scene), "error": str(error)})
     sheet = (
         None
@@ -70,22 +70,22 @@ def info(
     elif found:
         _print_table(found)
     if sheet is not None and not json_output:
-        print(sheet)
+        say(sheet)
     if failed:
         raise PointSplatError(f"{len(failed)} of {len(scenes)} scenes cannot be read")
 
 
 def _scenes_of(path: Path) -> list[Path]:
     """A scene itself, or the scenes of a folder."""
-    from pointsplat_ns.io.discovery import find_scenes
-    from pointsplat_ns.io.scene import is_folder_of_scenes
+    from pointsplat_ns.scene.discovery import find_scenes
+    from pointsplat_ns.scene.reading import is_folder_of_scenes
 
     return [*find_scenes(path).values()] if is_folder_of_scenes(path) else [path]
 
 
 def _print_table(found: list[SceneInfo]) -> None:
     """A line for each scene, sizes in MB."""
-    from pointsplat_ns.io.files import three_digits
+    from pointsplat_ns.system.files import three_digits
     from pointsplat_ns.system.terminal import print_table
 
     rows = []
@@ -107,39 +107,39 @@ def _print_table(found: list[SceneInfo]) -> None:
 
 
 def _print(found: SceneInfo) -> None:
-    from pointsplat_ns.io.files import bytes_text
+    from pointsplat_ns.system.files import bytes_text
 
-    print(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
-    print(
+    say(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
+    say(
         f"{found.gaussians:,} Gaussians of SH degree "
         f"{found.sh_degree}{', antialiased' if found.antialiased else ''}"
     )
     if found.offset:
-        print(f"positions are relative to {' '.join(map(repr, found.offset))}")
-    print(f"up: {found.up_text}{'; --up names another axis' if found.up_is_guess else ''}")
+        say(f"positions are relative to {' '.join(map(repr, found.offset))}")
+    say(f"up: {found.up_text}{'; --up names another axis' if found.up_is_guess else ''}")
     if found.fill is not None:
-        print(f"fill: {found.fill:.1f} Gaussians drawn per pixel, in {found.views}")
+        say(f"fill: {found.fill:.1f} Gaussians drawn per pixel, in {found.views}")
     if found.sh_energies:
         root = ", ".join(
             f"degree {index + 1}: {value**0.5:.3g}" for index, value in enumerate(found.sh_energies)
         )
-        print(f"what SH add to colours, root mean square: {root}")
+        say(f"what SH add to colours, root mean square: {root}")
     for name, corners in (("all", found.bounds), ("middle 96 %", found.content)):
         if corners:
             low, high = (" ".join(f"{value:.4g}" for value in corner) for corner in corners)
-            print(f"bounds, {name}: {low} to {high}, scene units")
+            say(f"bounds, {name}: {low} to {high}, scene units")
     step = 1 / max(len(found.opacities), 1)
     _bars("opacity", {f"{index * step:.1f}": count for index, count in enumerate(found.opacities)})
     _bars("largest standard deviation, scene units, from", found.sizes)
-    print(
+    say(
         "suspicious: "
         + (", ".join(f"{what} {n:,}" for what, n in found.suspicious.items()) or "nothing")
     )
 
 
 def _bars(title: str, counts: dict[str, int]) -> None:
-    print(f"{title}:")
+    say(f"{title}:")
     width = 40  # characters of the longest bar
     most = max([*counts.values(), 1])
     for name, count in counts.items():
-        print(f"  {name:>6} {'#' * round(width * count / most):<{width}} {count:,}")
+        say(f"  {name:>6} {'#' * round(width * count / most):<{width}} {count:,}")

@@ -8,26 +8,24 @@ from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
+from pointsplat_ns.pipeline.options import Bands, ViewOptions
 from pointsplat_ns.system.quantities import counted
-from pointsplat_ns.system.terminal import print_table
+from pointsplat_ns.system.terminal import print_table, say
 
 if TYPE_CHECKING:
-    from pointsplat_ns.levels.levels import Levels
+    from pointsplat_ns.tools.levels.levels import Levels
 
 
 def lod(
     scene: options.Scene,
+    looking: options.Flat[ViewOptions],
     levels: tuple[str, ...] = ("50%", "25%", "10%", "3%"),
     output: options.Output = None,
     stream: bool = False,
     tiles: bool = False,
     at: str | None = None,
-    sh: options.Bands = "all",
+    sh: Bands = "all",
     effort: Literal["instant", "quick", "thorough"] = "instant",
-    poses: options.Poses = None,
-    resolution: options.Resolution = None,
-    up: options.Up = None,
-    data: options.Data = None,
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
@@ -64,10 +62,10 @@ def lod(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.io.discovery import FOLDER_FILES
+    from pointsplat_ns.scene.discovery import FOLDER_FILES
 
     options.need_one_scene(scene)
-    options.check_poses(poses)
+    options.check_poses(looking.poses)
     folder = output or options.output_beside(
         scene, "stream" if stream else "tiles" if tiles else "lod", ""
     )
@@ -77,10 +75,10 @@ def lod(
         ("100%", *levels) if for_viewers else levels,
         sh=sh,
         effort=effort,
-        views=poses,
-        resolution=resolution,
-        up=up,
-        data=data,
+        views=looking.poses,
+        resolution=looking.resolution,
+        up=looking.up,
+        data=looking.data,
         folder=folder,
         stream=stream,
         tiles=tiles,
@@ -101,10 +99,10 @@ def lod(
 
 
 def _print_table(made: Levels, folder: Path) -> None:
-    from pointsplat_ns.compression.quality import word_for
-    from pointsplat_ns.io.discovery import FOLDER_FILES
-    from pointsplat_ns.io.files import bytes_text, three_digits
     from pointsplat_ns.pruning import ply_bytes
+    from pointsplat_ns.scene.discovery import FOLDER_FILES
+    from pointsplat_ns.system.files import bytes_text, three_digits
+    from pointsplat_ns.tools.wording import impression
 
     apart = (folder / FOLDER_FILES.levels).exists()  # each level has a PLY of its own
     rows = []
@@ -121,13 +119,11 @@ def _print_table(made: Levels, folder: Path) -> None:
                 f"{level.seconds:.1f}",
                 psnr_text(near.psnr if near else None),
                 f"{near.ssim:.2f}" if near and near.ssim is not None else "-",
-                word_for(near.psnr) if near else "-",
+                impression(near.psnr) if near else "-",
             )
         )
     files = [path for path in (folder, *folder.rglob("*")) if path.is_file()]
     size = bytes_text(sum(path.stat().st_size for path in files))
-    print(
-        f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all"
-    )
+    say(f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all")
     header = ("", "Gaussians", "share", "MB", "seconds", "dB", "SSIM", "")
     print_table(header, rows, "dB: PSNR against the dense scene", left=(0, 7))

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from pointsplat_ns.system.quantities import seconds_text
+from pointsplat_ns.system.terminal import say
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.quality import Quality
-    from pointsplat_ns.gaussians import Gaussians
-    from pointsplat_ns.io.ply import PlyRows
+    from pointsplat_ns.pipeline.quality import Quality
+    from pointsplat_ns.scene.gaussians import Gaussians
+    from pointsplat_ns.scene.ply import PlyRows
 
 _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
@@ -37,7 +38,7 @@ def only_json(args: list[str]) -> Iterator[None]:
 
 def print_json(content: Any) -> None:
     """Print a result as JSON."""
-    from pointsplat_ns.io.files import json_text
+    from pointsplat_ns.system.files import json_text
 
     print(json_text(content), file=_OUTPUT.get(), flush=True)
 
@@ -64,10 +65,14 @@ def print_result(
     scene: Gaussians | PlyRows,
     seconds: float,
     where: Path,
-    quality: Quality | str | None,
+    quality: Quality | None,
+    in_parts: bool = False,
 ) -> None:
     """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of
-    the file and time, and how close the file is to the dense scene, or why that is not known."""
+    the file and time, and how close the file is to the dense scene, or why that is not known; a
+    scene that was merged ``in_parts`` does not fit into memory."""
+    from pointsplat_ns.tools.wording import quality_text
+
     *first, last = [{"merge": "merged", "clean": "cleaned"}.get(by, f"pruned by {by}"), *also]
     done = f"{', '.join(first)} and {last}" if first else last
     what = f"{done} to {len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
@@ -76,8 +81,13 @@ def print_result(
             by, "nothing is pruned"
         )
         what = f"{nothing}, all {before:,} Gaussians fit as they are"
-    print(f"{where}: {what}, {written_size(where)}, in {seconds_text(seconds)}")
-    print(quality or "not compared with the dense scene: nothing of it is visible")
+    say(f"{where}: {what}, {written_size(where)}, in {seconds_text(seconds)}")
+    if quality is not None:
+        say(quality_text(quality))
+    elif in_parts:
+        say("not compared with the dense scene: it does not fit into memory")
+    else:
+        say("not compared with the dense scene: nothing of it is visible")
 
 
 def print_if_larger(scene: Path, where: Path) -> None:
@@ -89,7 +99,7 @@ def print_if_larger(scene: Path, where: Path) -> None:
             if scene.suffix == where.suffix
             else f"; a name that ends in {scene.suffix} makes it smaller"
         )
-        print(
+        say(
             f"note: {where} is larger than {scene}: {written_size(where)}, not "
             f"{written_size(scene)}{remedy}"
         )
@@ -98,13 +108,13 @@ def print_if_larger(scene: Path, where: Path) -> None:
 def psnr_text(psnr: float | None) -> str:
     """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was
     compared."""
-    from pointsplat_ns.compression.quality import MOST_SAID
+    from pointsplat_ns.tools.wording import BEST_PSNR
 
-    return "-" if psnr is None else "same" if psnr == math.inf else f"{min(psnr, MOST_SAID):.1f}"
+    return "-" if psnr is None else "same" if psnr == math.inf else f"{min(psnr, BEST_PSNR):.1f}"
 
 
 def written_size(where: Path) -> str:
     """Size of a scene's file, in words."""
-    from pointsplat_ns.io.files import bytes_text
+    from pointsplat_ns.system.files import bytes_text
 
     return bytes_text(where.stat().st_size)

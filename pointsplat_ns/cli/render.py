@@ -11,6 +11,7 @@ import tyro
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json
 from pointsplat_ns.system.quantities import seconds_text
+from pointsplat_ns.system.terminal import say
 
 
 def render(
@@ -45,12 +46,13 @@ def render(
     """
     options.need_scenes(scene, other)
     import pointsplat_ns as ps
-    from pointsplat_ns.io.files import bytes_text
+    from pointsplat_ns.system.files import bytes_text
+    from pointsplat_ns.system.outputs import unnamed
 
     start = time.perf_counter()
     options.check_poses(poses)
     beside = options.output_beside(scene, "render", ".mp4")
-    output = output or (
+    output = output or unnamed(
         beside if beside.name == "render.mp4" else beside.with_name(f"{scene.stem}.mp4")
     )
     count = ps.render_path(
@@ -74,4 +76,4 @@ def render(
         print_json({"output": output, "frames": count, "bytes": size, "seconds": seconds_taken})
         return
     frames = "1 frame" if count == 1 else f"{count} frames"
-    print(f"{output}: {frames}, {bytes_text(size)}, in {seconds_text(seconds_taken)}")
+    say(f"{output}: {frames}, {bytes_text(size)}, in {seconds_text(seconds_taken)}")

@@ -3,13 +3,24 @@ people write them."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
+import docstring_parser
 import tyro
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
+from pointsplat_ns.pipeline import options
+from pointsplat_ns.pipeline.options import NO_POSES, ReductionOptions, ViewOptions
 from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_number
 
 ONE_SCENE = "a file of any format, a checkpoint, or a run (its folder or config.yml)"
@@ -19,41 +30,29 @@ Scenes = Annotated[
     Path, tyro.conf.Positional, tyro.conf.arg(help=f"{ONE_SCENE}, or a folder of scenes")
 ]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
-Poses = Annotated[
-    Path | None,
-    tyro.conf.arg(
-        help="a file of cameras of the scene: cameras.json of 3DGS, transforms.json of "
-        "nerfstudio, or the folder of a COLMAP project. By default the views of its dataset, or of "
-        "such a file beside the scene or above it, or sampled ones; none always samples them."
-    ),
-]
-Resolution = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="WxH",
-        help="size of the pictures that people look at, pixels. Decisions by rendering are made "
-        "at this size. By "
-        "default the size of the photos, if there are any, else 1920x1080.",
-    ),
-]
-Up = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="AXIS",
-        help="the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are "
-        "sampled; by default the "
-        "file's own, or an estimate. Write --up=-y for a negative axis.",
-    ),
-]
-Data = Annotated[
-    Path | None,
-    tyro.conf.arg(
-        help="folder of the run's photos and poses, or one above it, if it is no longer where the "
-        "run says. In a "
-        "folder of scenes, a run whose data is not found gets sampled views, which its note says."
-    ),
-]
-Bands = Literal["all", "auto", "0", "1", "2", "3"]
+Options = TypeVar("Options")
+Flat = Annotated[Options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="", help="")]
+"""Options of a dataclass, without its name before theirs."""
+
+
+def _field_docstrings(kind: type) -> dict[str, str]:
+    """The docstring of each field of a dataclass and its bases, each as one paragraph."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__[:-1]):
+        for part in docstring_parser.parse_from_object(base).params:
+            if part.description is not None:
+                found[part.arg_name] = " ".join(part.description.split())
+    return found
+
+
+_VIEWS = _field_docstrings(ViewOptions)
+
+# For commands that take some of the ViewOptions.
+Poses = Annotated[options.Poses, tyro.conf.arg(help=_VIEWS["poses"])]
+Resolution = Annotated[options.Resolution, tyro.conf.arg(help=_VIEWS["resolution"])]
+Up = Annotated[str | None, tyro.conf.arg(metavar="AXIS", help=_VIEWS["up"])]
+Data = Annotated[Path | None, tyro.conf.arg(help=_VIEWS["data"])]
+
 Force = Annotated[bool, tyro.conf.arg(help="overwrite existing files.")]
 Jobs = Annotated[
     int | None,
@@ -73,17 +72,19 @@ Json = Annotated[
 def output_beside(scene: Path, what: str, suffix: str | None = None) -> Path:
     """The default path of a result, by default in the format of the scene's file. For a file, it is
     beside it: ``room_pruned.ply`` for ``room.ply``. For a run, it is in its folder: ``pruned.ply``;
-    never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint."""
-    from pointsplat_ns.io.formats import format_like
+    never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint.
+    Nobody named it: a symbolic link there is not followed."""
+    from pointsplat_ns.scene.formats import format_like
+    from pointsplat_ns.system.outputs import unnamed
 
     name = f"{what}{format_like(scene).suffix if suffix is None else suffix}"
     if scene.is_dir():
-        return scene / name
+        return unnamed(scene / name)
     if scene.absolute().parent.name == "nerfstudio_models":
-        return scene.absolute().parents[1] / name
+        return unnamed(scene.absolute().parents[1] / name)
     if scene.suffix.lower() in (".yml", ".yaml"):
-        return scene.with_name(name)
-    return scene.with_name(f"{scene.stem.removesuffix('.compressed')}_{name}")
+        return unnamed(scene.with_name(name))
+    return unnamed(scene.with_name(f"{scene.stem.removesuffix('.compressed')}_{name}"))
 
 
 def need_scenes(*paths: Path | None) -> None:
@@ -107,7 +108,7 @@ def need_scenes(*paths: Path | None) -> None:
 def need_one_scene(path: Path) -> None:
     """Raise a SceneError if the path is a folder of scenes."""
     from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.scene import SCENE_KINDS, is_folder_of_scenes
+    from pointsplat_ns.scene.reading import SCENE_KINDS, is_folder_of_scenes
 
     if is_folder_of_scenes(path):
         raise SceneError(
@@ -121,9 +122,9 @@ def check_outputs(
 ) -> None:
     """Check the files that a command is going to write (a scene of any writable format, a picture,
     a page) before its long computations. Raises SceneError if a path has another suffix, or as
-    :func:`~pointsplat_ns.io.files.need_writable`."""
-    from pointsplat_ns.io.files import need_suffix, need_writable
-    from pointsplat_ns.io.formats import format_to_write
+    :func:`~pointsplat_ns.system.files.need_writable`."""
+    from pointsplat_ns.scene.formats import format_to_write
+    from pointsplat_ns.system.files import need_suffix, need_writable
 
     if scene is not None:
         format_to_write(scene)
@@ -134,15 +135,14 @@ def check_outputs(
         need_writable(path, force)
 
 
-def check_poses(poses: Path | None) -> None:
+def check_poses(poses: Path | str | None) -> None:
     """Raise a SceneError if a path cannot hold cameras because it is a run or a scene."""
     if poses is None:
         return
     from pointsplat_ns.errors import SceneError
-    from pointsplat_ns.io.camera_files import CAMERA_KINDS, is_camera_file
-    from pointsplat_ns.photos.posed_scene import without_poses
+    from pointsplat_ns.scene.camera_files import CAMERA_KINDS, is_camera_file
 
-    if not (without_poses(poses) or is_camera_file(poses)):
+    if not (str(poses) == NO_POSES or is_camera_file(poses)):
         raise SceneError(
             f"{poses}: a run or a scene; expected {CAMERA_KINDS}; the poses of a run's own "
             "dataset need no --poses"
@@ -161,26 +161,6 @@ def _spec(metavar: str, parse: Callable[[str], Any]) -> PrimitiveConstructorSpec
     )
 
 
-def _photos(words: list[str]) -> Path | bool:
-    if len(words) > 1 or words == [""]:
-        raise ValueError("expected a folder of photos, or nothing for those of a run")
-    return Path(words[0]) if words else True
-
-
-Photos = Annotated[
-    Path | bool,
-    PrimitiveConstructorSpec(
-        nargs="*",
-        metavar="[FOLDER]",
-        instance_from_str=_photos,
-        is_instance=lambda value: isinstance(value, (bool, Path)),
-        str_from_instance=lambda value: (
-            [str(value)] if isinstance(value, Path) else [] if value else ["none"]
-        ),
-    ),
-]
-"""Whether to use the photos of a run, or the folder of other photos."""
-
 Megabytes = Annotated[float, _spec("MB", parse_megabytes)]
 """A size, in units of 10^6 bytes: 12, 12MB, 800kB or 1GB."""
 
@@ -195,10 +175,29 @@ def quantities() -> ConstructorRegistry:
     path = PrimitiveConstructorSpec(
         nargs=1,
         metavar="PATH",
-        instance_from_str=lambda words: _path(words[0]),
+        instance_from_str=lambda words: options.parse_path(words[0]),
         is_instance=lambda value: isinstance(value, Path),
         str_from_instance=lambda value: [str(value)],
     )
+
+    @registry.struct_rule
+    def options_with_plain_help(info: StructTypeInfo) -> StructConstructorSpec | None:
+        """Options of a dataclass, with each docstring as one paragraph."""
+        kind = info.type
+        if not (isinstance(kind, type) and issubclass(kind, (ViewOptions, ReductionOptions))):
+            return None
+        types = get_type_hints(kind, include_extras=True)
+        help_of = _field_docstrings(kind)
+        fields = tuple(
+            StructFieldSpec(
+                name=field.name,
+                type=types[field.name],
+                default=field.default,
+                helptext=help_of.get(field.name, ""),
+            )
+            for field in dataclasses.fields(kind)
+        )
+        return StructConstructorSpec(instantiate=kind, fields=fields)
 
     @registry.primitive_rule
     def number_or_path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
@@ -215,12 +214,6 @@ def quantities() -> ConstructorRegistry:
         return own[0] if own else rules.get(kinds[0])  # of an optional number as of the number
 
     return registry
-
-
-def _path(text: str) -> Path:
-    if not text:
-        raise ValueError("an empty path; expected a name, or . for the current folder")
-    return Path(text)
 
 
 def _float(text: str) -> float:

@@ -8,25 +8,23 @@ from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
+from pointsplat_ns.pipeline.options import ViewOptions
 from pointsplat_ns.system.quantities import counted
-from pointsplat_ns.system.terminal import print_table
+from pointsplat_ns.system.terminal import print_table, say
 
 if TYPE_CHECKING:
-    from pointsplat_ns.tradeoff.points import Tradeoff
+    from pointsplat_ns.tools.tradeoff.points import Tradeoff
 
 
 def tradeoff(
     scene: options.Scene,
+    looking: options.Flat[ViewOptions],
     output: options.Output = None,
     keep: tuple[str, ...] = ("70%", "50%", "30%", "20%", "10%", "5%"),
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
     repairs: tuple[Literal["none", "quick", "thorough", "photos"], ...] = ("none", "quick"),
     views: int = 12,
-    poses: options.Poses = None,
-    resolution: options.Resolution = None,
-    up: options.Up = None,
-    data: options.Data = None,
     photos: Path | None = None,
     force: options.Force = False,
     json_output: options.Json = False,
@@ -48,11 +46,11 @@ def tradeoff(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.quality import quality_line
-    from pointsplat_ns.tradeoff.points import RESULTS
-    from pointsplat_ns.tradeoff.recommend import next_best
+    from pointsplat_ns.tools.tradeoff.points import RESULTS
+    from pointsplat_ns.tools.tradeoff.recommend import next_best
+    from pointsplat_ns.tools.wording import quality_line
 
-    options.check_poses(poses)
+    options.check_poses(looking.poses)
     folder = output or options.output_beside(scene, "tradeoff", "")
     found = ps.measure_tradeoff(
         scene,
@@ -62,10 +60,10 @@ def tradeoff(
         by=by,
         repairs=repairs,
         views=views,
-        poses=poses,
-        resolution=resolution,
-        up=up,
-        data=data,
+        poses=looking.poses,
+        resolution=looking.resolution,
+        up=looking.up,
+        data=looking.data,
         photos=photos,
         force=force,
         progress=True,
@@ -75,27 +73,27 @@ def tradeoff(
         return
     _print_table(found)
     for note in found.notes:
-        print(f"note: {note}")
-    print(found.why)
+        say(f"note: {note}")
+    say(found.why)
     best = found.point(found.recommended)
     best = (
         next_best(found.points) or best if best is found.points[0] else best
     )  # the dense scene needs no command
     if best is not found.points[0]:
-        print(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
+        say(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
     if best.command:
-        print(f"$ {best.command}")
-    print(f"open {folder / RESULTS['page']}")
+        say(f"$ {best.command}")
+    say(f"open {folder / RESULTS['page']}")
 
 
 def _print_table(found: Tradeoff) -> None:
     """The figures that matter most; the others are in the table on disk."""
-    from pointsplat_ns.io.files import three_digits
+    from pointsplat_ns.system.files import three_digits
 
     photos = found.points[0].against_photos is not None
     count = counted(len(found.points), "point")
-    print(f"{found.scene}: {count}, judged in {found.judged_in}, {found.views_origin}")
-    print(found.machine)
+    say(f"{found.scene}: {count}, judged in {found.judged_in}, {found.views_origin}")
+    say(found.machine)
     rows = []
     for point in found.points:
         rows.append(

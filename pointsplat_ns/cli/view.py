@@ -7,6 +7,7 @@ from pathlib import Path
 import tyro
 
 from pointsplat_ns.cli import scene_options as options
+from pointsplat_ns.system.terminal import say
 
 
 def view(
@@ -37,8 +38,8 @@ def view(
     with ps.open_viewer(
         scene, other, views=poses, up=up, data=data, host=host, port=port
     ) as viewer:
-        print(f"{viewer.url}: open it in a browser; Ctrl-C ends it")
-        print(
+        say(f"{viewer.url}: open it in a browser; Ctrl-C ends it")
+        say(
             f"it begins at {viewer.origin}" if viewer.origin else "drop a scene on the page",
             flush=True,
         )

@@ -1,2 +1,1 @@
-"""Geometry that several parts use: rotations, camera axes, nearest neighbours, space-filling
-curves."""
+"""Geometry shared by several parts: rotations, camera axes, neighbours, space-filling curves."""

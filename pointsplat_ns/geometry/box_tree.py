@@ -1,10 +1,10 @@
 """Nearest neighbours in plain torch, on any device: exact, in the precision of the points.
 
-The tree halves the points again and again, across the widest axis of their box, down to leaves of
-few points. A query takes the points of one leaf first, whose distances bound how far its nearest
-may be. Then it goes down the tree, level by level, into all boxes that are nearer. Many queries
-take each level together. Whatever the distribution, the tree has as many levels, and a place where
-all points coincide is not searched again.
+The tree halves the points recursively, across the widest axis of their box, down to leaves of a few
+points. A query first visits one leaf, whose distances are upper bounds. It then descends the tree,
+level by level, into all boxes within these bounds. Many queries process each level together. The
+depth of the tree does not depend on the distribution of the points, and coincident points are not
+searched again.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ class BoxTree:
 
     Args:
         points: (N, 3), finite, float32 or float64, on any device; N is at least 1.
-        k: largest number of neighbours that is asked for. A leaf has at least as many points, and
-            at least 8.
+        k: maximum number of neighbours per query. A leaf has at least as many points, and at least
+            8.
     """
 
     PAIRS_AT_ONCE = 1 << 19
-    """Number of pairs of a query and a box that are searched at once; 0.7 GB in a leaf."""
+    """Number of pairs of query and box that are searched at a time; 0.7 GB in a leaf."""
 
     def __init__(self, points: Tensor, k: int):
         n = len(points)
         device = points.device
         self.order = numbers(n, device)
-        """Indices (N,) of the points along the tree, in which near points follow each other."""
+        """Indices (N,) of the points in tree order, which puts near points together."""
         self._boxes: list[
             tuple[Tensor, Tensor]
         ] = []  # lowest and highest corners (2^level, 3) of each level
         while True:
             level = len(self._boxes)
-            # parts of equally many points, one more or less
+            # halves of equal size, up to one point
             self._starts = ((numbers((1 << level) + 1, device) * n) + (1 << level) - 1) >> level
             self._points = points[self.order]
             self._width = (n >> level) + 1
@@ -55,22 +55,22 @@ class BoxTree:
             self.order = self.order[along[part[along].sort(stable=True).indices]]
 
     def nearest(self, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """The points nearest to queries, the nearest first.
+        """The points nearest to each query, nearest first.
 
         Args:
             queries: (m, 3), finite, of the dtype and on the device of the points.
             k: number of neighbours, at least 1, and at most N and that of the tree.
 
         Returns:
-            Distances (m, k), and indices (m, k) int64. Of points that are equally far, any may come
-            first.
+            Distances (m, k), and indices (m, k) int64. Points at the same distance are in any
+            order.
         """
         found = [self._nearest(some, k) for some in queries.split(self.PAIRS_AT_ONCE // 16)]
         squares, spots = (torch.cat(parts) for parts in zip(*found, strict=True))
         return squares.sqrt(), self.order[spots]
 
     def _nearest(self, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """Squared distances (m, k), and places (m, k) in the order of the tree."""
+        """Squared distances (m, k), and positions (m, k) in tree order."""
         m = len(queries)
         first = numbers(m, queries.device).mul_(0)
         for level in range(1, len(self._boxes)):
@@ -114,15 +114,15 @@ class BoxTree:
         return torch.maximum(low[box] - queries, queries - high[box]).clamp_min_(0).square().sum(1)
 
     def _in_leaves(self, queries: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared distances (p, w) of queries (p, 3) from the points of leaves (p,), infinite where
-        a leaf has fewer, and the places (p, w) of these points in the order of the tree."""
+        """Squared distances (p, w) of queries (p, 3) from the points of leaves (p,), infinite for
+        padding, and the positions (p, w) of these points in tree order."""
         spots = self._spots(leaf)
         squares = (queries[:, None] - self._points[spots]).square().sum(2)
         squares[:, 1:].masked_fill_(spots[:, 1:] == spots[:, :-1], torch.inf)
         return squares, spots
 
     def _spots(self, part: Tensor) -> Tensor:
-        """Places (p, w) in the order of the tree of the points in parts (p,) of the last level; the
-        last place again where there are fewer."""
+        """Positions (p, w) in tree order of the points in parts (p,) of the last level, padded with
+        the last position."""
         spots = self._starts[part][:, None] + numbers(self._width, part.device)
         return torch.minimum(spots, self._starts[part + 1][:, None] - 1)

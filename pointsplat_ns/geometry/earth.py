@@ -1,4 +1,4 @@
-"""Places on the Earth: UTM and geographic coordinates in the Earth-centred frame of 3D Tiles
+"""Geo-referencing: UTM and geographic coordinates in the Earth-centred frame of 3D Tiles
 (EPSG:4978, metres)."""
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ _FROM_CONFORMAL = (
 
 @dataclass(frozen=True)
 class Place:
-    """Where a scene lies on the Earth: its coordinates are those of a UTM zone, or its origin is a
-    point."""
+    """Position of a scene on the Earth: its coordinates are in a UTM zone, or its origin is at a
+    geographic point."""
 
     zone: int | None = None
     """1 to 60; negative south of the equator."""
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Latitude and longitude in degrees, and metres above the ellipsoid, if there is no zone."""
+    """Latitude and longitude in degrees, and metres above the ellipsoid, without a zone."""
 
     @classmethod
     def parse(cls, text: str) -> Place:
-        """The place in a text: EPSG:32632 (UTM of WGS 84; 258.. of ETRS89), or LATITUDE,LONGITUDE
-        or LATITUDE,LONGITUDE,HEIGHT. Raises PointSplatError for any other."""
+        """Parse EPSG:32632 (UTM of WGS 84; 258.. for ETRS89), LATITUDE,LONGITUDE or
+        LATITUDE,LONGITUDE,HEIGHT. Raises PointSplatError for any other text."""
         code = re.fullmatch(r"EPSG:(326|327|258)(\d\d)", text.strip(), re.IGNORECASE)
         if code and 1 <= int(code[2]) <= 60:
             return cls(-int(code[2]) if code[1] == "327" else int(code[2]))
@@ -63,15 +63,15 @@ class Place:
         )
 
     def frame(self, point: Tensor, turn: Tensor) -> Tensor:
-        """The matrix (4, 4) float64 from a scene's axes about a point of it to the Earth-centred
-        frame.
+        """The matrix (4, 4) float64 from a scene's axes, centred at one of its points, to the
+        Earth-centred frame.
 
         Args:
-            point: (3,) float64, in the coordinates of the zone, or from the scene's origin.
-            turn: (3, 3) float64, makes the scene's up z, if there is no zone. y is north.
+            point: (3,) float64, in coordinates of the zone, or relative to the scene's origin.
+            turn: (3, 3) float64, rotates the scene to z-up, without a zone. y is north.
 
         Raises:
-            SceneError: if the point is not in the zone.
+            SceneError: if the point is outside of the zone.
         """
         matrix = torch.eye(4, **DOUBLES)
         if self.zone is None:
@@ -91,7 +91,7 @@ class Place:
                 f"the scene lies at {east:.7g} {point[1]:.7g}; expected coordinates of UTM zone "
                 f"{abs(self.zone)}"
             )
-        step = 100.0  # metres; curvature and rounding are below 1e-10 of it
+        step = 100.0  # metres; the relative error by curvature and rounding is below 1e-10
         behind, ahead = (
             _earth_centred(*_unprojected(east, north_of_equator + way, self.zone), height)
             for way in (-step, step)
@@ -123,7 +123,7 @@ def _earth_centred(latitude: float, longitude: float, height: float) -> Tensor:
 
 def _unprojected(east: float, north: float, zone: int) -> tuple[float, float]:
     """Latitude and longitude, radians, of a point in a UTM zone, metres from the equator: Krueger's
-    series, 1912, which errs by less than a millimetre within 3000 km of the zone's middle."""
+    series, 1912, with an error below a millimetre within 3000 km of the central meridian."""
     plane = complex(north, east - 5e5) / (0.9996 * _MERIDIAN)
     sphere = plane - sum(term * cmath.sin(2 * k * plane) for k, term in enumerate(_TO_SPHERE, 1))
     conformal = math.asin(math.sin(sphere.real) / math.cosh(sphere.imag))

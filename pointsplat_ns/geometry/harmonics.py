@@ -25,7 +25,7 @@ C3 = (
 
 
 def basis_rows(unit: Tensor, degree: int) -> list[Tensor]:
-    """The (degree + 1)^2 basis functions, (M,) each, in directions (3, M) of length 1."""
+    """The (degree + 1)^2 basis functions, (M,) each, in unit directions (3, M)."""
     x, y, z = unit
     rows = [torch.full_like(x, SH_C0)]
     if degree >= 1:
@@ -71,8 +71,8 @@ def sh_matrix(matrix: Tensor, degree: int) -> Tensor:
     band of degree 1 to 3, for a rotation of directions by an orthogonal ``matrix`` (3, 3), float64.
 
     The coefficients ``c'`` of the rotated function satisfy ``Y(d) c' = Y(matrix^T d) c`` for every
-    direction ``d``. They are found by least squares over fixed directions; the solution is exact,
-    as rotations preserve bands.
+    direction ``d``. They are computed by least squares over fixed directions; the solution is
+    exact, because rotations preserve bands.
     """
     directions, basis = _directions()
     band = slice(degree**2, (degree + 1) ** 2)

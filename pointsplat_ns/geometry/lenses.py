@@ -1,4 +1,4 @@
-"""Lenses: where the pixels of a pinhole's picture lie in the photo that a lens took.
+"""Lens distortion: maps pixels of a pinhole image to the distorted photo.
 
 Source: the camera models of COLMAP and OpenCV, "Camera Calibration and 3D Reconstruction" and
 "Fisheye camera model" in OpenCV's documentation.
@@ -19,9 +19,9 @@ class Lens(NamedTuple):
     """The distortion of a lens."""
 
     fisheye: bool
-    """Whether angles, and not their tangents, are proportional to pixels."""
+    """Whether pixel distances are proportional to angles rather than to their tangents."""
     params: tuple[float, ...]
-    """k1 to k4 of a fisheye; else k1, k2, p1, p2, k3, k4, k5, k6."""
+    """k1 to k4 for a fisheye; otherwise k1, k2, p1, p2, k3, k4, k5, k6."""
 
 
 _MODELS = {
@@ -37,13 +37,12 @@ _MODELS = {
     "RADIAL_FISHEYE": True,
     "OPENCV_FISHEYE": True,
 }
-"""Models of COLMAP whose parameters are the first ones of OpenCV's, and whether each is a
-fisheye."""
+"""COLMAP models whose parameters are a prefix of OpenCV's, and whether they are fisheyes."""
 
 
 def lens_of(model: str, distortion: tuple[float, ...]) -> Lens | None:
-    """The lens of a camera model of COLMAP and its parameters of distortion; None if it is a
-    pinhole. Raises ValueError, with the reason, if it is not known how to undo it."""
+    """The lens of a COLMAP camera model with distortion parameters; None for a pinhole. Raises
+    ValueError, with the reason, if undistortion is not supported."""
     if model not in _MODELS:
         raise ValueError(f"distortion of the model {model}; expected one of {', '.join(_MODELS)}")
     if not all(math.isfinite(number) for number in distortion):
@@ -55,8 +54,7 @@ def lens_of(model: str, distortion: tuple[float, ...]) -> Lens | None:
 
 
 def distorted(lens: Lens, points: Tensor) -> Tensor:
-    """Points (..., 2) of the plane at depth 1, where a pinhole sees them, moved to where the lens
-    shows them."""
+    """Undistorted points (..., 2) in the plane at depth 1, moved to their distorted positions."""
     r = points.norm(dim=-1, keepdim=True)
     if lens.fisheye:
         return points * _ratio(lens, r)
@@ -71,7 +69,7 @@ def distorted(lens: Lens, points: Tensor) -> Tensor:
 
 
 def _ratio(lens: Lens, r: Tensor) -> Tensor:
-    """Factor on radii ``r`` at depth 1, without the tangential part."""
+    """Radial distortion factor for radii ``r`` at depth 1."""
     if lens.fisheye:
         angle = r.atan()
         square = angle**2
@@ -84,19 +82,19 @@ def _ratio(lens: Lens, r: Tensor) -> Tensor:
 
 
 def pixel_map(lens: Lens, K: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Where the pixels of a pinhole's picture lie in a photo of the same intrinsics and size.
+    """Map pixels of a pinhole image to a photo of the same intrinsics and size.
 
-    A polynomial of distortion turns back beyond the pictures that it was fitted to: radii there are
-    not taken.
+    A distortion polynomial turns back outside of the image range that it was fitted to; larger
+    radii are invalid.
 
     Args:
         lens: of the photo.
-        K: (3, 3) intrinsics, pixels, the first pixel's centre at (0.5, 0.5).
+        K: (3, 3) intrinsics, pixels; the centre of the first pixel is (0.5, 0.5).
         width, height: pixels.
 
     Returns:
-        (H, W, 2) float32, x and y in the photo, its sides at -1 and 1; and whether the photo shows
-        the pixel, (H, W) bool.
+        (H, W, 2) float32, x and y in the photo, with its sides at -1 and 1; and whether the photo
+        contains the pixel, (H, W) bool.
     """
     focal = K.new_tensor([K[0, 0], K[1, 1]])
     centre = K[:2, 2]

@@ -1,5 +1,4 @@
-"""Nearest neighbours among points in space: exact, in float64. On a CPU, scipy's k-d tree finds
-them."""
+"""Nearest neighbours of points: exact, in float64; on a CPU with scipy's k-d tree."""
 
 from __future__ import annotations
 
@@ -12,15 +11,13 @@ from pointsplat_ns.system.tensors import FLOATS, numbers
 from pointsplat_ns.system.threads import in_threads, most_threads
 
 QUERIES_AT_ONCE = 1 << 14
-"""Number of points whose neighbours a thread searches at once, to save memory; on a GPU, eight
-times as many."""
+"""Number of points per search in a thread, to limit memory; eight times as many on a GPU."""
 
 
 def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The nearest points of every point, the nearest first; a point is its own nearest.
+    """The nearest points of every point, nearest first; a point is its own nearest.
 
-    Where several points coincide, any of them may come first. Runs on the CPU, with as many threads
-    as torch uses.
+    Coincident points are in any order. Runs on the CPU, with as many threads as torch uses.
 
     Args:
         points: (N, D), finite, any floating type and device.
@@ -43,13 +40,13 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def import_tree() -> None:
-    """Import scipy before it is needed: it takes long."""
+    """Import scipy in advance, because it takes long."""
     import scipy.spatial  # noqa: F401
 
 
 class _CpuTree:
-    """What :class:`~pointsplat_ns.geometry.box_tree.BoxTree` is elsewhere, of points (N, D)
-    float64, by scipy."""
+    """Equivalent of :class:`~pointsplat_ns.geometry.box_tree.BoxTree` for points (N, D) float64,
+    with scipy."""
 
     def __init__(self, points: Tensor):
         from scipy.spatial import cKDTree
@@ -58,12 +55,11 @@ class _CpuTree:
 
     @property
     def order(self) -> Tensor:
-        return torch.from_numpy(
-            self._tree.indices.copy()
-        )  # newer releases give what must not be written to
+        # newer releases return a read-only array
+        return torch.from_numpy(self._tree.indices.copy())
 
     def nearest(self, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        # The ranks are listed, because k = 1 would drop their axis.
+        # A list of ranks, because k = 1 would drop the axis.
         distances, indices = self._tree.query(
             queries.numpy(), k=list(range(1, k + 1)), workers=most_threads()
         )
@@ -71,23 +67,23 @@ class _CpuTree:
 
 
 def _tree_of(points: Tensor, k: int) -> _CpuTree | BoxTree:
-    """A tree of points (N, 3) that finds at most ``k`` neighbours."""
+    """A search tree of points (N, 3) for at most ``k`` neighbours."""
     return _CpuTree(points) if points.device.type == "cpu" else BoxTree(points, k)
 
 
 def other_neighbours(points: Tensor, k: int) -> Tensor:
-    """The nearest other points of every point, without their distances, in little memory.
+    """The nearest other points of every point, without distances, in little memory.
 
-    Where more than k points coincide, their nearest ones are the same few. So each of them has, in
-    place of its last two, those before and after it in the order of the search tree, where no two
-    coincident points are far apart.
+    If more than k points coincide, all have the same nearest few. So each of them gets, in place of
+    its last two neighbours, its predecessor and successor in tree order, where coincident points
+    are close together.
 
     Args:
         points: (N, 3) float64, finite, on any device.
         k: number of neighbours, at least 2.
 
     Returns:
-        Indices (N, k) int32 on that device, the nearest first; a point's own index stands for none.
+        Indices (N, k) int32 on that device, nearest first; a point's own index means none.
     """
     own = numbers(len(points), points.device)
     near = own.to(torch.int32)[:, None].repeat(1, k)
@@ -99,8 +95,8 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
 
     def search(these: slice) -> None:
         _, indices = tree.nearest(points[these], found)
-        # The point itself is the first, or, among coincident ones, anywhere or missing: the first
-        # takes its place.
+        # The point itself comes first, or, among coincident points, anywhere or not at all: then
+        # the first is replaced.
         indices = indices.where(indices != own[these, None], indices[:, :1])
         near[these, : found - 1] = indices[:, 1:].to(torch.int32)
         same[these] = (points[near[these, k - 1].long()] == points[these]).all(1)
@@ -119,7 +115,7 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
 
 
 class NearestOf:
-    """The nearest points of other places.
+    """Nearest points of arbitrary positions.
 
     Args:
         points: (N, 3) float64, finite, on any device; N is at least 1.
@@ -132,5 +128,5 @@ class NearestOf:
 
     def __call__(self, queries: Tensor) -> Tensor:
         """Indices (m, min(k, N)) int64 of the points nearest to queries (m, 3) float64, finite, on
-        their device; the nearest first."""
+        their device; nearest first."""
         return self._tree.nearest(queries, self._k)[1]

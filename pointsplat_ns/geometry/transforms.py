@@ -1,7 +1,7 @@
-"""Rotations, poses of cameras, and positions along a space-filling curve.
+"""Rotations, camera poses and space-filling curves.
 
-gsplat, COLMAP and the Replica files have cameras with OpenCV's axes (x right, y down, z forward);
-nerfstudio has OpenGL's (x right, y up, z back).
+gsplat, COLMAP and the Replica files use OpenCV camera axes (x right, y down, z forward); nerfstudio
+uses OpenGL axes (x right, y up, z back).
 """
 
 from __future__ import annotations
@@ -14,19 +14,18 @@ from torch import Tensor
 from pointsplat_ns.system.tensors import DOUBLES
 
 AXES = ("x", "y", "z", "-x", "-y", "-z")
-"""Names of the directions along the axes of the world."""
+"""Names of the directions along the world axes."""
 
 
 def direction_of(axis: str) -> Tensor:
-    """The direction (3,), float64, that one of :data:`AXES` names."""
+    """The direction (3,), float64, of a name in :data:`AXES`."""
     direction = torch.zeros(3, **DOUBLES)
     direction["xyz".index(axis[-1])] = -1.0 if axis[0] == "-" else 1.0
     return direction
 
 
 def axis_along(direction: Tensor) -> str | None:
-    """The name of the axis along a direction (3,) of length 1, up to rounding; None if it lies
-    along none."""
+    """Name of the axis along a unit direction (3,), up to rounding; None if there is none."""
     axis = int(direction.abs().argmax())
     if float(direction.abs()[axis]) <= 1 - 1e-6:
         return None
@@ -34,13 +33,13 @@ def axis_along(direction: Tensor) -> str | None:
 
 
 def flip_camera_axes(camera_to_worlds: Tensor) -> Tensor:
-    """Camera-to-world matrices (..., 3 or 4, 4) with OpenGL axes from OpenCV ones, or the other way
-    round: the second and third columns change their sign."""
+    """Convert camera-to-world matrices (..., 3 or 4, 4) between OpenGL and OpenCV axes, in either
+    direction: the second and third columns change sign."""
     return camera_to_worlds * camera_to_worlds.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
 def invert_rigid(matrices: Tensor) -> Tensor:
-    """Inverses (C, 4, 4) of rigid motions (C, 3 or 4, 4): the rotation's inverse is its transpose.
+    """Inverses (C, 4, 4) of rigid motions (C, 3 or 4, 4): the rotation is transposed.
     Differentiable."""
     rotation = matrices[:, :3, :3].transpose(1, 2)
     translation = -rotation @ matrices[:, :3, 3:]
@@ -49,8 +48,8 @@ def invert_rigid(matrices: Tensor) -> Tensor:
 
 
 def viewmats_from_opengl(camera_to_worlds: Tensor) -> Tensor:
-    """World-to-camera matrices with OpenCV axes (C, 4, 4), as rasterizers take them, from
-    nerfstudio's camera-to-world (C, 3, 4), which have OpenGL axes. Differentiable."""
+    """World-to-camera matrices (C, 4, 4) with OpenCV axes, for rasterizers, from nerfstudio's
+    camera-to-world matrices (C, 3, 4) with OpenGL axes. Differentiable."""
     return invert_rigid(flip_camera_axes(camera_to_worlds))
 
 
@@ -60,17 +59,17 @@ def viewmats_to_opengl(viewmats: Tensor) -> Tensor:
 
 
 SHORTEST = torch.finfo(torch.float32).tiny
-"""Smallest normal number of float32. A quaternion whose largest component is below it is taken for
-zero, in any precision: float32 has no inverse of its length, so its direction would depend on the
-precision."""
+"""Smallest normal number of float32. A quaternion whose largest component is below it counts as
+zero, in any precision: the inverse of its length overflows float32, so its direction would depend
+on the precision."""
 
 
 def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
     """Unit vectors (D, M) of the columns of (D, M), and the inverse of their lengths (M).
 
-    A zero vector, or one shorter than :data:`SHORTEST`, becomes zero, and so does
-    its inverse length: it has no gradient. The length is taken after division by the largest
-    component, so that neither 1e-30 nor 1e30 under- or overflows.
+    A zero vector, or one shorter than :data:`SHORTEST`, becomes zero, and so does its inverse
+    length: it has no gradient. The length is computed after division by the largest component, so
+    that neither 1e-30 nor 1e30 under- or overflows.
     """
     largest = vectors.abs().amax(dim=0)
     zero = largest < SHORTEST
@@ -112,8 +111,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotation matrices of quaternions of any length.
 
     Args:
-        quats: (N, 4) wxyz, finite; zero is the identity, and so are those shorter than
-            :data:`SHORTEST`.
+        quats: (N, 4) wxyz, finite; zero, or shorter than :data:`SHORTEST`, is the identity.
 
     Returns:
         (N, 3, 3), of the same dtype.
@@ -130,9 +128,9 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def quaternions_of(matrices: Tensor) -> Tensor:
     """Quaternions (..., 4) wxyz, float64, of rotation matrices (..., 3, 3).
 
-    The entries of a matrix are products of the components of q. They give 4 q q^T, of which the row
-    with the largest diagonal is the best multiple of q (Shepperd 1978, Journal of Guidance and
-    Control 1(3)).
+    The entries of a matrix are products of the components of q. They give 4 q q^T. Its row with the
+    largest diagonal entry is the most accurate multiple of q (Shepperd 1978, Journal of Guidance
+    and Control 1(3)).
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrices.double().unbind(-2))
     rows = [
@@ -151,7 +149,7 @@ def quaternions_of(matrices: Tensor) -> Tensor:
 
 
 def zero_as_identity(quats: Tensor) -> Tensor:
-    """Quaternions (N, 4), with the identity in place of each that is zero or shorter than
+    """Quaternions (N, 4), with the identity for those that are zero or shorter than
     :data:`SHORTEST`."""
     largest = quats.detach().abs().amax(dim=1, keepdim=True)
     # In float32, because half precision would round the bound to 0.
@@ -159,8 +157,7 @@ def zero_as_identity(quats: Tensor) -> Tensor:
 
 
 def spread_bits(x: Tensor) -> Tensor:
-    """Move bit k of every integer to bit 3k, for k below 21, in five steps of half the distance
-    each.
+    """Move bit k of every integer to bit 3k, for k below 21, in five steps of halving distance.
 
     Args:
         x: int64 of any shape; bits from 21 on are dropped.
@@ -179,7 +176,7 @@ def spread_bits(x: Tensor) -> Tensor:
 
 
 def interleave(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """The Morton code of three coordinates whose bits are spread; x has the highest bit."""
+    """Morton code of three coordinates with spread bits; x has the highest bit."""
     return (x << 2).bitwise_or_(y << 1).bitwise_or_(z)
 
 
@@ -192,7 +189,7 @@ class Cube(NamedTuple):
 
 def bulk_cube(means: Tensor) -> Cube:
     """The cube around the bulk of positions (N, 3), twice as wide as 98 % of them along the widest
-    axis: the few distant Gaussians of most scenes do not coarsen the grid of the others."""
+    axis, so that a few distant Gaussians do not coarsen the grid of the others."""
     some = means[:: max(1, len(means) // 2**14)].double()
     n = len(some)
     ranked = some.sort(dim=0).values
@@ -203,8 +200,8 @@ def bulk_cube(means: Tensor) -> Cube:
 
 
 def unit_cells(means: Tensor, cube: Cube | None = None) -> Tensor:
-    """Positions (N, 3), float32, in a cube that becomes the unit cube, by default
-    :func:`bulk_cube`; those outside are clamped to [0, 1]."""
+    """Positions (N, 3), float32, relative to a cube that becomes the unit cube, by default
+    :func:`bulk_cube`; clamped to [0, 1]."""
     cube = cube or bulk_cube(means)
     return (means.double() - cube.centre).div_(cube.side).float().clamp_(-0.5, 0.5).add_(0.5)
 
@@ -217,8 +214,8 @@ def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
 
 
 def smallest_turn(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (3, 3) from one direction to another; one of many if they are
-    opposite."""
+    """The smallest rotation (3, 3) from one direction to another; not unique for opposite
+    directions."""
     cosine = float(start @ end)
     if cosine < -1 + 1e-12:
         side = torch.linalg.cross(start, torch.eye(3, **DOUBLES)[int(start.abs().argmin())])

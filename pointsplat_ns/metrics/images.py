@@ -1,5 +1,4 @@
-"""Image metrics: PSNR and SSIM (LPIPS, which needs weights, is in
-:mod:`pointsplat_ns.metrics.lpips`).
+"""Image metrics: PSNR and SSIM (LPIPS is in :mod:`pointsplat_ns.metrics.lpips`).
 
 Images are (H, W, 3) or (B, H, W, 3), in [0, 1]; values are not clamped. Each metric returns a
 scalar for one image and (B,) for a batch, one value per image.
@@ -21,8 +20,9 @@ class ImageError(PointSplatError, ValueError):
 
 
 def as_nchw(pred: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Both images as (B, 3, H, W), B = 1 for single ones. Raises ImageError if their shapes differ,
-    are not (H, W, 3) or (B, H, W, 3), or hold no pixel, or if a type is not floating-point."""
+    """Both images as (B, 3, H, W), with B = 1 for single images. Raises ImageError if their shapes
+    differ or are not (H, W, 3) or (B, H, W, 3), if they have no pixels, or if a dtype is not
+    floating-point."""
     for name, image in (("pred", pred), ("target", target)):
         if image.dim() not in (3, 4) or image.shape[-1] != 3 or image.numel() == 0:
             raise ImageError(
@@ -42,7 +42,7 @@ def as_nchw(pred: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def per_image(values: Tensor, like: Tensor) -> Tensor:
-    """``values`` (B,) as a scalar where ``like`` is a single image."""
+    """``values`` (B,) as a scalar if ``like`` is a single image."""
     return values[0] if like.dim() == 3 else values
 
 
@@ -70,12 +70,11 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
 
 
 def psnr_of(error: float, covered: float = 1.0) -> float:
-    """PSNR over the pixels that a scene covers, dB: all squared error, halos beside the scene
-    included, divided by the share of the pixels that it covers. Empty background does not make it
-    better.
+    """PSNR over the pixels that a scene covers, dB: the sum of all squared errors, including halos
+    beside the scene, divided by the share of covered pixels. Empty background does not improve it.
 
-    ``error`` is the mean squared error over all pixels, data range 1. Where the share ``covered``,
-    in [0, 1], is 0, all pixels count. inf for no error, NaN for NaN.
+    ``error`` is the mean squared error over all pixels, data range 1. If the share ``covered``, in
+    [0, 1], is 0, all pixels count. Returns inf for zero error, and NaN for NaN.
 
     Example:
         >>> psnr_of(0.001), psnr_of(0.001, covered=0.1)
@@ -87,7 +86,7 @@ def psnr_of(error: float, covered: float = 1.0) -> float:
 
 
 MOST_PSNR = 100.0
-"""In place of the infinite PSNR of equal images, so that means over views stay finite."""
+"""Replaces the infinite PSNR of equal images, so that means over views stay finite."""
 
 
 def finite_psnr(pred: Tensor, target: Tensor) -> float:
@@ -99,10 +98,10 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004), data range 1.
 
     11 x 11 Gaussian window of sigma 1.5, population moments, averaged over the channels and over
-    the pixels whose whole window lies inside the image, as in the original publication.
-    pytorch-msssim, and so Splatfacto, computes the same. Others pad the image and average over the
-    border, too: torchmetrics by reflection, the original 3DGS code with zeros. Their values differ
-    a little and should not be compared with these.
+    the pixels whose whole window is inside the image, as in the original publication.
+    pytorch-msssim, and so Splatfacto, computes the same. Other libraries pad the image and include
+    the border: torchmetrics by reflection, the original 3DGS code with zeros. Their values differ
+    slightly and should not be compared with these.
 
     Args:
         pred: (H, W, 3) or (B, H, W, 3), in [0, 1], at least 11 pixels a side.
@@ -127,7 +126,7 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
             f"images of {a.shape[3]} x {a.shape[2]} pixels are smaller than SSIM's window; "
             f"expected at least {SSIM_WINDOW} x {SSIM_WINDOW}"
         )
-    # eps=0: the two constants of the definition already keep the denominator positive.
+    # eps=0, because the definition's two constants already keep the denominator positive.
     values = kornia.metrics.ssim(
         a.contiguous(), b.contiguous(), SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid"
     )

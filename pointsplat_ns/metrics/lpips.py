@@ -1,9 +1,8 @@
-"""LPIPS: perceptual distance of images (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep
-Features as a Perceptual Metric").
+"""LPIPS: perceptual image distance (Zhang et al. 2018).
 
-The network is torchmetrics', with its linear weights, on torchvision's AlexNet or VGG16. If the
-weights of these are not available, :func:`load_lpips` says why, and everything else works without
-LPIPS.
+Source: "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric". The network is
+torchmetrics', with its linear weights, on torchvision's AlexNet or VGG16. If their weights are not
+available, :func:`load_lpips` says why, and everything else works without LPIPS.
 """
 
 from __future__ import annotations
@@ -18,17 +17,17 @@ import torch
 from torch import Tensor, nn
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.files import one_line
 from pointsplat_ns.metrics import ImageError, as_nchw, per_image
+from pointsplat_ns.system.files import one_line
 
 Net = Literal["alex", "vgg"]
 
 WEIGHTS_VARIABLE = "POINTSPLAT_LPIPS_WEIGHTS"
-"""Environment variable: a folder with backbones under one of their usual names."""
+"""Environment variable: a folder with backbone weights under one of their usual names."""
 
 
 class LpipsUnavailable(PointSplatError):
-    """The weights of LPIPS, or torchvision, are not available; the message says why, in one
+    """The weights of LPIPS, or torchvision, are not available; the message gives the reason in one
     line."""
 
 
@@ -37,7 +36,7 @@ class _Backbone(NamedTuple):
 
     minimum: int  # image side below which its last layer is empty
     files: tuple[str, str]  # usual file names; the second is torchvision's own
-    digest: str  # SHA-256 of torchvision's file, of which its name has the first 8 digits
+    digest: str  # SHA-256 of torchvision's file, whose name has the first 8 digits
 
 
 _BACKBONES = {
@@ -60,30 +59,29 @@ class Lpips(nn.Module):
     def __init__(self, net: Net) -> None:
         super().__init__()
         try:
-            import torchvision  # noqa: F401  # torchmetrics' own error does not tell why
+            import torchvision  # noqa: F401  # torchmetrics' own error omits the reason
             from torchmetrics.functional.image.lpips import _LPIPS, ScalingLayer
         except (ImportError, RuntimeError) as error:  # not installed, or built for another torch
             raise LpipsUnavailable(
                 f"LPIPS needs torchvision, which cannot be imported ({one_line(error)})"
             ) from error
         self.net = net
-        with torch.device("meta"):  # no random numbers are drawn for weights that are replaced
+        with torch.device("meta"):  # no random numbers for weights that are replaced
             self.network = _LPIPS(pretrained=False, net=net, pnet_rand=True)
         with torch.device("cpu"):
-            self.network.scaling_layer = ScalingLayer().float()  # constants, which are in no file
+            self.network.scaling_layer = ScalingLayer().float()  # constants that no file contains
 
     def load(self, path: Path) -> Lpips:
-        """This network, frozen, with the weights of a backbone's file: the whole backbone or its
-        convolutions alone. Raises LpipsUnavailable if the file holds others."""
+        """This network, frozen, with the weights of a backbone's file: the whole backbone or only
+        its convolutions. Raises LpipsUnavailable if the file holds other weights."""
         from torchmetrics.functional.image import lpips
 
         linear = Path(lpips.__file__).with_name("lpips_models") / f"{self.net}.pth"
         weights = torch.load(linear, map_location="cpu", weights_only=True)
         try:
             backbone = torch.load(path, map_location="cpu", weights_only=True)
-            for name in (
-                self.network.net.state_dict()
-            ):  # slice2.5.weight is torchvision's features.5.weight
+            # slice2.5.weight is torchvision's features.5.weight
+            for name in self.network.net.state_dict():
                 weights[f"net.{name}"] = backbone[f"features.{name.partition('.')[2]}"].float()
             self.network.load_state_dict(weights, strict=False, assign=True)
         except Exception as error:  # a damaged pickle can raise nearly anything
@@ -94,7 +92,7 @@ class Lpips(nn.Module):
         return self.requires_grad_(False)
 
     def forward(self, pred: Tensor, target: Tensor) -> Tensor:
-        """LPIPS of each image pair, in float32; arguments, result and errors are those of
+        """LPIPS of each image pair, in float32; arguments, result and errors as for
         :func:`lpips`."""
         a, b = as_nchw(pred, target)
         least = _BACKBONES[self.net].minimum
@@ -111,17 +109,17 @@ class Lpips(nn.Module):
 def load_lpips(net: Net = "alex", download: bool = True) -> Lpips:
     """LPIPS with its weights, on the CPU.
 
-    The backbone comes from the first of these that there is: what the environment variable
-    ``POINTSPLAT_LPIPS_WEIGHTS`` names; torch hub's checkpoint cache; torchvision's download into
-    that cache. A file may hold the whole network or its convolutions alone, and is loaded with
-    ``weights_only=True``.
+    The backbone is searched for in the folder that the environment variable
+    ``POINTSPLAT_LPIPS_WEIGHTS`` names, then in torch hub's checkpoint cache; torchvision downloads
+    it into that cache. A file may hold the whole network or only its convolutions, and is loaded
+    with ``weights_only=True``.
 
     Args:
         net: ``"alex"`` (in most papers) or ``"vgg"`` (in most losses).
-        download: whether the network may be used.
+        download: whether to download missing weights.
 
     Raises:
-        LpipsUnavailable: if the weights are not available, or torchvision is not.
+        LpipsUnavailable: if the weights or torchvision are not available.
     """
     if net not in _BACKBONES:
         raise LpipsUnavailable(
@@ -135,9 +133,8 @@ def load_lpips(net: Net = "alex", download: bool = True) -> Lpips:
 
 
 def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
-    """LPIPS on a device, loaded at the first call and the same object afterwards. Arguments and
-    errors are those of :func:`load_lpips`. A failed download is not tried again, unless a file is
-    found."""
+    """LPIPS on a device, loaded at the first call and then cached. Arguments and errors are those
+    of :func:`load_lpips`. A failed download is not repeated, unless a file appears."""
     path = _file(net) if net in _BACKBONES else Path()
     found = _loaded(net, str(torch.device(device)), path, path.is_file())
     if isinstance(found, str):
@@ -147,7 +144,7 @@ def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
 
 @functools.lru_cache(maxsize=4)  # 10 MB for alex, 59 MB for vgg
 def _loaded(net: Net, device: str, path: Path, there: bool) -> Lpips | str:
-    """LPIPS on a device, or why there is none, while the file ``path`` is or is not there."""
+    """LPIPS on a device, or why it is unavailable; ``there`` says whether ``path`` exists."""
     try:
         return load_lpips(net).to(device)
     except LpipsUnavailable as error:
@@ -155,14 +152,14 @@ def _loaded(net: Net, device: str, path: Path, there: bool) -> Lpips | str:
 
 
 class ReportedLpips:
-    """LPIPS for reports, which returns None instead of raising if LPIPS is not available. Not a
-    module, so that checkpoints of a model do not hold its weights."""
+    """LPIPS for reports: returns None instead of raising if LPIPS is not available. Not a module,
+    so that a model's checkpoints do not contain its weights."""
 
     reason: str | None = None
-    """The latest reason for a missing value; None while none is missing."""
+    """The latest reason for a missing value; None if no value is missing."""
 
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
-        """LPIPS by AlexNet as :func:`lpips` gives it; None, with ``reason`` set, where it cannot be
+        """LPIPS with AlexNet, as :func:`lpips`; None, with ``reason`` set, if it cannot be
         computed."""
         try:
             return cached_lpips("alex", pred.device)(pred, target)
@@ -175,13 +172,14 @@ class ReportedLpips:
 
 
 def _file(net: Net) -> Path:
-    """The backbone's file: what the environment variable names, else torch hub's, which may not be
-    there. LpipsUnavailable if the variable names no folder."""
+    """The backbone's file: in the folder that the environment variable names, else in torch hub's
+    cache, where it may be missing. Raises LpipsUnavailable if the variable does not name a
+    folder."""
     files = _BACKBONES[net].files
     if named := os.environ.get(WEIGHTS_VARIABLE):
         folder = Path(named).expanduser()
         if not folder.is_dir():
-            raise LpipsUnavailable(f"{folder}: no such folder, though {WEIGHTS_VARIABLE} names it")
+            raise LpipsUnavailable(f"{folder}: no such folder; {WEIGHTS_VARIABLE} names it")
         for name in files:
             if (folder / name).is_file():
                 return folder / name
@@ -190,12 +188,12 @@ def _file(net: Net) -> Path:
 
 def _download(net: Net, target: Path, allowed: bool) -> None:
     """Download torchvision's file into torch hub's cache, atomically. A file with another SHA-256
-    is not kept."""
+    is deleted."""
     remedy = f"set {WEIGHTS_VARIABLE} to a folder with {' or '.join(_BACKBONES[net].files)}"
     if not allowed:
-        raise LpipsUnavailable(f"{target}: LPIPS's {net} backbone is not there; {remedy}")
+        raise LpipsUnavailable(f"{target}: LPIPS's {net} backbone is missing; {remedy}")
     timeout = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(15.0)  # seconds without an answer
+    socket.setdefaulttimeout(15.0)  # seconds without a response
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         url = f"https://download.pytorch.org/models/{target.name}"
@@ -224,7 +222,7 @@ def lpips(pred: Tensor, target: Tensor, net: Literal["alex", "vgg"] = "alex") ->
         A scalar, or (B,); 0 for identical images. Differentiable.
 
     Raises:
-        LpipsUnavailable: if the weights are not available; the text tells the reason.
+        LpipsUnavailable: if the weights are not available; the message gives the reason.
         ImageError: if the images cannot be compared.
 
     Example:

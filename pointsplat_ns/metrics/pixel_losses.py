@@ -1,4 +1,4 @@
-"""Losses of the pixels of two images."""
+"""Pixel losses of two images."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 from pointsplat_ns.system.threads import one_thread
 
 PixelLoss = Literal["l1", "rmse"]
-"""Mean absolute difference, or root mean squared difference, which determines the PSNR."""
+"""Mean absolute error, or root mean squared error, which determines the PSNR."""
 
 
 def _rmse(difference: Tensor) -> Tensor:
-    with one_thread():  # the gradient depends on the sum, which more threads round in another way
+    with one_thread():  # the rounding of the sum, and so the gradient, depends on the thread count
         # 1e-12 (120 dB) keeps the gradient of the root finite for identical images.
         return (difference.square().mean() + 1e-12).sqrt()
 

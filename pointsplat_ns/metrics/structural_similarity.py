@@ -1,14 +1,14 @@
 """A fast SSIM for training losses.
 
-It is defined as in pytorch-msssim, which Splatfacto uses, and in :func:`pointsplat_ns.ssim`, which
-uses kornia. Both blur five maps one after the other. Here a compiled kernel
-(``structural_similarity.cpp``) does all at once, for float32 on a CPU where it was built; elsewhere
-torch blurs them together, which takes about half the time of one by one. Tests check that all
-agree.
+The definition is that of pytorch-msssim, which Splatfacto uses, and of :func:`pointsplat_ns.ssim`,
+which uses kornia. Both blur five maps one after the other. Here a compiled kernel
+(``structural_similarity.cpp``) blurs all in one pass, for float32 on a CPU; without the kernel,
+torch blurs them in one batch, which takes about half the time. Tests check that all agree.
 """
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import math
 
@@ -17,31 +17,61 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.system.kernels import KERNELS, on_threads
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.tensors import DOUBLES
 
+
+class SimilarityStruct(Struct):
+    """``Similarity`` of ``structural_similarity.cpp``, which says what its members are."""
+
+    members = {
+        "image": FLOAT_POINTER,
+        "other": FLOAT_POINTER,
+        "window": FLOAT_POINTER,
+        "planes": ctypes.c_int64,
+        "height": ctypes.c_int64,
+        "row": ctypes.c_int64,
+        "step": ctypes.c_int64,
+        "bands": ctypes.c_int64,
+        "partials": FLOAT_POINTER,
+        "sums": DOUBLE_POINTER,
+        "grad": FLOAT_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+similarity_kernel = Function("pointsplat_similarity", SimilarityStruct, INT64_POINTER)
+
 SSIM_WINDOW = 11
-"""Side of SSIM's Gaussian window in pixels."""
+"""Side of SSIM's Gaussian window, pixels."""
 
 
 def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Tensor:
     """Mean structural similarity (Wang et al. 2004, eq. 13) of two images.
 
-    An 11 x 11 Gaussian window of sigma 1.5, population moments, and only pixels whose window lies
-    inside the image. A side shorter than the window is not blurred along, as in pytorch-msssim.
+    11 x 11 Gaussian window of sigma 1.5, population moments, only pixels whose window is inside the
+    image. A side shorter than the window is not blurred, as in pytorch-msssim.
 
     Args:
         image: (B, C, H, W), in [0, 1].
         other: the same shape.
-        compiled: False leaves it to torch; True warns if there is no kernel.
+        compiled: False uses torch; True warns if the kernel is missing.
 
     Returns:
         A scalar in [-1, 1]; 1 for identical images. Differentiable.
     """
     if _suited(image, other) and KERNELS.usable_for(compiled, image, other):
-        if (
-            other.requires_grad and torch.is_grad_enabled()
-        ):  # it is symmetric, and the kernel's gradient by the first
+        # symmetric, and the kernel gives the gradient of the first argument
+        if other.requires_grad and torch.is_grad_enabled():
             image, other = other, image
         return CompiledSimilarity.apply(image, other)
     maps = torch.cat([image, other, image * image, other * other, image * other], dim=1)
@@ -72,16 +102,16 @@ def _blur(maps: Tensor) -> Tensor:
 
 @functools.cache
 def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Weights (11,) along one side."""
-    with torch.inference_mode(False):  # it is kept, and gradients may be taken through it later
+    """Window weights (11,) along one side."""
+    with torch.inference_mode(False):  # cached, and later used with gradients
         offset = torch.arange(SSIM_WINDOW, dtype=dtype, device=device) - SSIM_WINDOW // 2
         weight = torch.exp(-offset.square() / (2 * 1.5**2))  # sigma of 1.5 pixels
         return weight / weight.sum()
 
 
 def _suited(image: Tensor, other: Tensor) -> bool:
-    """Whether the kernel can take images of these sizes, and a gradient by one of them at most is
-    asked for."""
+    """Whether the kernel supports images of these sizes, with a gradient for at most one of
+    them."""
     return (
         image.dim() == 4
         and image.shape == other.shape
@@ -92,12 +122,11 @@ def _suited(image: Tensor, other: Tensor) -> bool:
 
 
 class CompiledSimilarity(torch.autograd.Function):
-    """:func:`mean_ssim` by the kernel, with the gradient by the first image."""
+    """:func:`mean_ssim` by the kernel, with the gradient of the first image."""
 
     @staticmethod
     def forward(ctx, image, other):
-        # Where the channels of pixels lie together, as in a render, they are taken so; at most
-        # MOST_STEP of the kernel.
+        # Interleaved channels, as in a render, are used in place; at most MOST_STEP of the kernel.
         interleaved = image.shape[1] <= 4 and image.permute(0, 2, 3, 1).is_contiguous()
         order = (0, 2, 3, 1) if interleaved else (0, 1, 2, 3)
         image, other = (tensor.detach().permute(order).contiguous() for tensor in (image, other))
@@ -108,7 +137,7 @@ class CompiledSimilarity(torch.autograd.Function):
         step, row = (side, image.shape[2] * side) if interleaved else (1, side)
         rows = height - SSIM_WINDOW + 1
         windows = row - (SSIM_WINDOW - 1) * step
-        # rows of a band
+        # rows per band
         ctx.shape = (planes, height, row, step, math.ceil(rows / 48))
         ctx.interleaved = interleaved
         ctx.count = planes * rows * windows
@@ -137,7 +166,7 @@ def _call(
     grad: Tensor | None = None,
 ) -> None:
     planes, height, row, step, bands = shape
-    task = KERNELS.structs["Similarity"](
+    task = SimilarityStruct(
         image=image,
         other=other,
         window=_window(image.dtype, image.device),
@@ -150,4 +179,4 @@ def _call(
         sums=sums,
         grad=grad,
     )
-    on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)
+    on_threads(planes * bands > 1, similarity_kernel, task)

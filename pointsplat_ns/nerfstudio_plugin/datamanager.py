@@ -9,14 +9,17 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
 )
 
+from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, UndistortedDataset
+from pointsplat_ns.nerfstudio_plugin.image_guard import photos_alone
+from pointsplat_ns.system.files import one_line
 
 
 @dataclass
@@ -36,11 +39,29 @@ class LazyImageDatamanagerConfig(FullImageDatamanagerConfig):
 
 class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
     """Full images, undistorted, and pinhole cameras, in the order of nerfstudio's datamanager for
-    the same seed."""
+    the same seed.
+
+    Raises DataError if the dataparser finds no training photos. nerfstudio's own dataparsers end in
+    errors of all kinds then, such as a division by zero for one photo.
+    """
 
     config: LazyImageDatamanagerConfig
     latest_photo: str = ""
     """Name of the photo of the latest training step."""
+
+    def __init__(self, config: LazyImageDatamanagerConfig, *args: Any, **kwargs: Any):
+        try:
+            with photos_alone():
+                super().__init__(config, *args, **kwargs)
+        except PointSplatError:
+            raise
+        except (ArithmeticError, AssertionError, LookupError, OSError, ValueError) as error:
+            kind = type(config.dataparser).__name__.removesuffix("Config")
+            raise DataError(
+                f"{config.data}: {kind} cannot load training photos from it "
+                f"({type(error).__name__}: {one_line(error, 120)}); expected two or more photos "
+                "with poses in the layout that it reads"
+            ) from error
 
     @cached_property
     def frame_cache(self) -> MemoryCache:

@@ -1,20 +1,16 @@
-"""The poses and photos of a run's dataset."""
+"""The poses and photos of a run's dataset, registered for the package by an entry point."""
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.errors import DataError, MissingPackageError, SceneError, need
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
-from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
-from pointsplat_ns.photos.examples import Photos
-from pointsplat_ns.photos.posed_scene import check_photos
-from pointsplat_ns.view_source import ViewSource
-from pointsplat_ns.views import Views
+from pointsplat_ns.pipeline.photos.examples import Photos
+from pointsplat_ns.pipeline.photos.posed_scene import check_photos
+from pointsplat_ns.scene.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.scene.views import Views
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import Split
@@ -53,21 +49,6 @@ def dataset_views(
     return _scene_at(path, data).views(split)
 
 
-def view_source(
-    scene: Gaussians,
-    given: Views | None = None,
-    run: Path | str | None = None,
-    data: Path | str | None = None,
-    resolution: tuple[int, int] | None = None,
-    up: Up | None = None,
-) -> ViewSource:
-    """The source of a scene's views: given ones, those of a run's dataset, else sampled ones;
-    arguments as of :class:`~pointsplat_ns.view_source.ViewSource` and :func:`dataset_views`."""
-    return ViewSource(
-        scene, given, run, functools.partial(dataset_views, data=data), resolution, up
-    )
-
-
 def run_photos(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Photos:
     """The photos of a split of a run's dataset, read when they are asked for. Arguments and errors
     are those of :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked
@@ -78,19 +59,36 @@ def run_photos(path: Path | str, split: Split = "train", data: Path | str | None
     return scene.photos(split)
 
 
-def need_named_data(scene: object, data: Path | str | None) -> None:
-    """If the data of a run is named, check that it serves: a PointSplatError if ``scene`` is no
-    path of a run, the poses cannot be read there, or photos are not like renders. Where nothing is
-    named, data that is missing is no error."""
-    if data is None:
-        return
-    if not isinstance(scene, (str, Path)) or not may_be_run(scene):
-        what = scene if isinstance(scene, (str, Path)) else "a scene in memory"
+def check_named_data(run: object, data: Path | str) -> None:
+    """Check that the data that was named for a run serves: a PointSplatError if ``run`` is no path
+    of a run, the poses cannot be read there, or photos are not like renders."""
+    if not isinstance(run, (str, Path)) or not may_be_run(run):
+        what = run if isinstance(run, (str, Path)) else "a scene in memory"
         raise SceneError(
             f"{what}: no run, so it has no data at {data}; expected a run, or no --data"
         )
-    trained = _scene_at(scene, data)
+    trained = _scene_at(run, data)
     check_photos(trained.read_dense(), trained.photos("train"), data)
+
+
+class NerfstudioData:
+    """The datasets of nerfstudio's runs, for :mod:`pointsplat_ns.pipeline.run_data`."""
+
+    def views(self, run: Path | str, split: Split, data: Path | str | None) -> Views:
+        """As :func:`dataset_views`."""
+        return dataset_views(run, split, data)
+
+    def photos(self, run: Path | str, split: Split, data: Path | str | None) -> Photos:
+        """As :func:`run_photos`."""
+        return run_photos(run, split, data)
+
+    def check_named(self, run: object, data: Path | str) -> None:
+        """As :func:`check_named_data`."""
+        check_named_data(run, data)
+
+
+RUN_DATA = NerfstudioData()
+"""The object of the entry point."""
 
 
 def _scene_at(path: Path | str, data: Path | str | None) -> TrainedScene:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import threading
+import warnings
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +29,8 @@ from PIL import Image
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.pictures import exif_hint
+from pointsplat_ns.scene.image_files import IMAGE_ERRORS, MOST_PIXELS, exif_hint, open_image
+from pointsplat_ns.system.files import one_line
 from pointsplat_ns.system.tensors import DOUBLES
 
 
@@ -58,10 +60,18 @@ class UndistortedDataset(InputDataset):
         self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32"
     ) -> dict[str, Any]:
         """``image`` (H, W, 3 or 4), uint8 or float32 in [0, 1], of the pinhole camera, ``mask`` (H,
-        W, 1) bool where the dataset has masks, and ``image_idx``."""
+        W, 1) bool where the dataset has masks, and ``image_idx``.
+
+        nerfstudio's own method opens both files again, by content: no file of the formats that
+        :func:`~pointsplat_ns.scene.image_files.open_image` takes is another one to Pillow.
+        """
         path = self.image_filenames[image_idx]
+        masks = self._dataparser_outputs.mask_filenames
         try:
-            with Image.open(path) as photo:
+            if masks is not None:
+                with open_image(masks[image_idx]):
+                    pass
+            with open_image(path) as photo:
                 if photo.mode not in (
                     "L",
                     "RGB",
@@ -71,15 +81,17 @@ class UndistortedDataset(InputDataset):
                         f"its pixels are of mode {photo.mode}; expected 8-bit grey, RGB or RGBA; "
                         "convert it"
                     )
-            data = super().get_data(image_idx, image_type)
+            with warnings.catch_warnings():  # of sizes below our limit
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                data = super().get_data(image_idx, image_type)
         except FileNotFoundError as error:
             raise DataError(
                 f"{error.filename or path}: no such file, but frame {image_idx} of the dataset "
                 "needs it"
             ) from error
-        except (OSError, SyntaxError, ValueError, AssertionError) as error:
+        except (*IMAGE_ERRORS, AssertionError) as error:
             raise DataError(
-                f"{path}: cannot be read as the photo of frame {image_idx}: {error}"
+                f"{path}: cannot be read as the photo of frame {image_idx}: {one_line(error)}"
             ) from error
         camera = self.lens_cameras[image_idx : image_idx + 1]
         height, width = data["image"].shape[:2]
@@ -175,8 +187,8 @@ def _undistorted(
 
 
 def _need_sound_cameras(dataset: InputDataset) -> None:
-    """Refuse cameras with NaN or infinity, and photos of a scene that moves. Those without times
-    are taken to be of a still scene."""
+    """Refuse cameras with NaN, infinity or a size of no photo, and photos of a scene that moves.
+    Those without times are taken to be of a still scene."""
     cameras = dataset.cameras
     paths = dataset.image_filenames
     numbers = [cameras.camera_to_worlds.flatten(1), cameras.fx, cameras.fy, cameras.cx, cameras.cy]
@@ -190,6 +202,14 @@ def _need_sound_cameras(dataset: InputDataset) -> None:
             f"{paths[bad[0]]}: the pose or the intrinsics of frame {bad[0]} hold NaN or infinity, "
             f"as do those of {len(bad) - 1} more of {len(cameras)}; expected numbers; correct them "
             "or leave the photo out"
+        )
+    width = cameras.width[:, 0].double()
+    height = cameras.height[:, 0].double()
+    odd = ((width < 1) | (height < 1) | (width * height > MOST_PIXELS)).nonzero()[:, 0].tolist()
+    if odd:
+        raise DataError(
+            f"{paths[odd[0]]}: the camera of frame {odd[0]} has {int(width[odd[0]])} x "
+            f"{int(height[odd[0]])} pixels; expected the size of its photo"
         )
     if cameras.times is not None and len(cameras.times.unique()) > 1:
         raise DataError(

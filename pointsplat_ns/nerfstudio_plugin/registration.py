@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Any
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.system.terminal import say
 
 JIT_SCRIPT = "ignore:`torch.jit.script` is deprecated:FutureWarning:torch.jit._script"
 """Value of the environment variable PYTHONWARNINGS that hides a warning: nerfstudio scripts a
@@ -43,7 +44,7 @@ def errors_in_one_line() -> None:
         kind: type[BaseException], error: BaseException, traceback: TracebackType | None
     ) -> None:
         if isinstance(error, PointSplatError):
-            print(f"error: {error}", file=sys.stderr)
+            say(f"error: {error}", error=True)
         else:
             before(kind, error, traceback)
 

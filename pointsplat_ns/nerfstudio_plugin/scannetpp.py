@@ -15,11 +15,11 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetpp, ScanNetppDataParserConfig
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import flip_camera_axes
-from pointsplat_ns.io.files import read_text
+from pointsplat_ns.nerfstudio_plugin.console import log
+from pointsplat_ns.system.files import read_text
 from pointsplat_ns.system.tensors import INDICES
 
 SOURCES = (
@@ -105,7 +105,7 @@ class SeededScanNetpp(ScanNetpp):
                     "that is not; --skip-bad False takes bad ones"
                 )
             missing = sum(name in hidden for name in names)
-            CONSOLE.log(
+            log(
                 f"{where}: of {len(names)} frames {len(names) - len(kept) - missing} that are "
                 f"marked is_bad and {missing} that are hidden are left out"
             )
@@ -117,7 +117,7 @@ class SeededScanNetpp(ScanNetpp):
             model = located.data / located.colmap_path
             points = list(_read(model, "points3D").values()) if model.is_dir() else []
             if not points:
-                CONSOLE.log(f"{model}: no points of COLMAP, so no seed points")
+                log(f"{model}: no points of COLMAP, so no seed points")
                 return outputs
             poses = {
                 name: np.array(frame["transform_matrix"], dtype=np.float64)
@@ -189,7 +189,7 @@ def _split(config: SeededScanNetppDataParserConfig) -> tuple[dict[str, Any], set
     fraction = config.train_split_fraction
     if fraction is None and not shown:
         why = "the photos of the test are hidden" if hidden else "no photos are named for a test"
-        CONSOLE.log(f"{path}: {why}, so every tenth training photo is held out")
+        log(f"{path}: {why}, so every tenth training photo is held out")
         fraction = (
             min(0.9, (len(frames) - 1.5) / len(frames)) if len(frames) > 1 else 0.9
         )  # of few photos one

@@ -4,6 +4,7 @@ are not finite."""
 from __future__ import annotations
 
 import functools
+import shutil
 import signal
 import sys
 import threading
@@ -11,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, NoReturn
 
@@ -19,17 +21,20 @@ import yaml
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from tyro.conf import Fixed, Suppress
 
-from pointsplat_ns.errors import DataError, PointSplatError
-from pointsplat_ns.io.files import one_line, replacing
-from pointsplat_ns.io.runs import step_of
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
+from pointsplat_ns.nerfstudio_plugin.option_checks import check_options
+from pointsplat_ns.scene.checkpoints import read_training_state
+from pointsplat_ns.scene.runs import RUN_FILES, step_of
 from pointsplat_ns.system import processes
+from pointsplat_ns.system.files import one_line, replacing
 from pointsplat_ns.system.memory import keep_freed_memory
+from pointsplat_ns.system.terminal import say
 from pointsplat_ns.system.threads import fixed_threads, one_thread_each
 
 STATE = "pointsplat"
@@ -56,30 +61,70 @@ class StoppableTrainerConfig(TrainerConfig):
     gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
     log_gradients: Suppress[Fixed[bool]] = False
 
-    def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all. Raises PointSplatError if it cannot be written,
-        or no step is asked for."""
+    def set_timestamp(self) -> None:
+        """As nerfstudio's. It is the first that ``ns-train`` calls, so all options are checked
+        here, before anything is written."""
+        self.check()
+        super().set_timestamp()
+
+    def check(self) -> None:
+        """Raise PointSplatError for options that no training can have."""
         if self.max_num_iterations < 1:
             raise PointSplatError(
                 f"--max-num-iterations {self.max_num_iterations}: expected at least 1; a run is "
                 "shown and measured without a training by ns-viewer, ns-render and ns-eval"
             )
-        path = self.get_base_dir() / "config.yml"
-        CONSOLE.log(f"Saving config to: {path}")
-        with replacing(path) as part:
-            part.write_text(yaml.dump(self), "utf-8")
+        check_options(self)
+
+    def save_config(self) -> None:
+        """Write nothing yet: the trainer does, once scenes and checkpoints are loaded, so that a
+        command that fails leaves no folder of a run (:meth:`write_config`)."""
+
+    def write_config(self) -> None:
+        """Write ``config.yml``, whole or not at all, by the first process. Raises PointSplatError
+        if it cannot be written."""
+        path = self.get_base_dir() / RUN_FILES.config
+
+        def write() -> None:
+            log(f"Saving config to: {path}")
+            with replacing(path, named=False) as part:
+                part.write_text(yaml.dump(self), "utf-8")
+
+        processes.by_first(write)
+
+    def trainer(self, fitted: Any, **kwargs: Any) -> Trainer:
+        """The trainer of a copy of this config, fitted to the training; what it saves as
+        ``config.yml`` is this one."""
+        self.check()
+        trainer = self._target(fitted, **kwargs)
+        trainer.given_config = self
+        return trainer
 
     def first_step(self) -> int:
         """The step that a training begins with: 0, or the step in the name of the checkpoint that
         it resumes from."""
-        if self.load_dir is not None and self.load_step is not None:
-            return self.load_step + 1
-        paths = (
-            [self.load_checkpoint] if self.load_dir is None else self.load_dir.glob("step-*.ckpt")
-        )
-        return max(
-            (step + 1 for path in paths if path and (step := step_of(path)) is not None), default=0
-        )
+        path = self.checkpoint_to_load()
+        step = None if path is None else step_of(path)
+        return 0 if step is None else step + 1
+
+    def checkpoint_to_load(self) -> Path | None:
+        """The checkpoint that a training goes on from; None if it begins anew. Raises SceneError if
+        there is no such file."""
+        folder = self.load_dir
+        if folder is None:
+            path = self.load_checkpoint
+            if path is not None and not path.is_file():
+                raise SceneError(f"--load-checkpoint {path}: no such file; expected step-N.ckpt")
+            return path
+        steps = {
+            step: path for path in folder.glob("step-*.ckpt") if (step := step_of(path)) is not None
+        }
+        wanted = max(steps, default=None) if self.load_step is None else self.load_step
+        if wanted not in steps:
+            found = ", ".join(map(str, sorted(steps))) or "none"
+            what = "a run's nerfstudio_models" if wanted is None else f"step {wanted}"
+            raise SceneError(f"--load-dir {folder}: expected checkpoints of {what}; found {found}")
+        return steps[wanted]
 
 
 class StoppableTrainer(Trainer):
@@ -97,6 +142,10 @@ class StoppableTrainer(Trainer):
     """
 
     config: StoppableTrainerConfig
+    given_config: StoppableTrainerConfig | None = None
+    """The config that is saved: as given, before it was fitted to the training."""
+    _own_folder = False
+    """Whether the run's folder was not there before."""
     _asked: int | None = None
     """Number of the signal that asked it to stop."""
     _between_steps = False
@@ -107,16 +156,20 @@ class StoppableTrainer(Trainer):
         self.skipped: Counter[str] = Counter()
         """Number of steps that were skipped, by photo or scene, over all processes."""
         self._skipped_in_a_row = 0
+        self._own_folder = not self.base_dir.exists()
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio's; a line of the log names the rasterizer."""
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
-            super().setup(test_mode)
+            with self._no_folder_of_nothing():
+                super().setup(test_mode)
+                if self.given_config is not None:
+                    self.given_config.write_config()
             model = self.config.pipeline.model
             if self.local_rank == 0 and isinstance(model, RasterizerOptions):
-                CONSOLE.log(model.engine(torch.device(self.device)))
+                log(model.engine(torch.device(self.device)))
         except KeyboardInterrupt:
             _interrupted(signal.SIGINT)
         if self.local_rank == 0:
@@ -129,15 +182,62 @@ class StoppableTrainer(Trainer):
         nerfstudio saves none and ends with 0, as if it had finished."""
         with fixed_threads(self.config.threads), self._signals_noted():
             try:
-                super().train()
+                with self._no_folder_of_nothing():
+                    super().train()
             except KeyboardInterrupt:
                 if self._between_steps and self.step > self._start_step:
                     self.save_checkpoint(self.step - 1)
-                    CONSOLE.log(
+                    log(
                         f"Saved after step {self.step - 1}. The run is usable as it is; to go on: "
                         f"--load-dir {self.checkpoint_dir}"
                     )
                 _interrupted(self._asked or signal.SIGINT)
+
+    @contextmanager
+    def _no_folder_of_nothing(self) -> Iterator[None]:
+        """If an error ends this before a step is done, remove the run's folder, unless it was there
+        before."""
+        try:
+            yield
+        except BaseException:
+            if self._own_folder and self.local_rank == 0 and self.step <= self._start_step:
+                for kind in [kind for kind in writer.EVENT_WRITERS if hasattr(kind, "tb_writer")]:
+                    kind.tb_writer.close()
+                    writer.EVENT_WRITERS.remove(kind)
+                shutil.rmtree(self.base_dir, ignore_errors=True)
+                for above in self.base_dir.parents[:3]:  # METHOD, EXPERIMENT, the output folder
+                    with suppress(OSError):  # not empty
+                        above.rmdir()
+            raise
+
+    def _load_checkpoint(self) -> None:
+        """As nerfstudio's. Raises SceneError if the checkpoint is missing, truncated, or of another
+        method or other settings."""
+        path = self.config.checkpoint_to_load()
+        if path is None:
+            return
+        content = read_training_state(path)
+        try:
+            self.pipeline.load_pipeline(content["pipeline"], content["step"])
+            self.optimizers.load_optimizers(content["optimizers"])
+            if "schedulers" in content and self.config.load_scheduler:
+                self.optimizers.load_schedulers(content["schedulers"])
+            self.grad_scaler.load_state_dict(content["scalers"])
+            self._start_step = content["step"] + 1
+            self.put_back(content.get(STATE))
+        except PointSplatError:
+            raise
+        except Exception as error:  # the file's content can be anything
+            raise SceneError(
+                f"{path}: no training of {self.config.method_name} can go on from it "
+                f"({type(error).__name__}: {one_line(error, 160)}); expected a checkpoint of the "
+                "same method and settings"
+            ) from error
+        self.step = self._start_step
+        log(f"going on after step {content['step']} of {path}")
+
+    def put_back(self, state: Any) -> None:
+        """Put back :meth:`state_to_resume`; None if the checkpoint has none."""
 
     def _train_complete_viewer(self) -> None:
         """Keep the viewer open after the last step until Ctrl-C or SIGTERM, once: the training is
@@ -223,7 +323,7 @@ class StoppableTrainer(Trainer):
         for name, text in processes.gathered([(source, "; ".join(faults))] if faults else []):
             self.skipped[name] += 1
             if self.skipped[name] == 1 and processes.rank() == 0:
-                CONSOLE.log(f"step {step} is skipped: {name}: {text} (said once for each)")
+                log(f"step {step} is skipped: {name}: {text} (said once for each)")
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -248,7 +348,7 @@ class StoppableTrainer(Trainer):
             content[STATE] = state
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         # Unfinished in the run's folder: nerfstudio takes every file beside checkpoints for one.
-        with replacing(path, tensor_bytes(content), self.base_dir) as part:
+        with replacing(path, tensor_bytes(content), self.base_dir, named=False) as part:
             try:
                 torch.save(content, part)
             except RuntimeError as error:  # what torch makes of a disk that is full after all
@@ -288,10 +388,7 @@ class StoppableTrainer(Trainer):
         self._between_steps = self.training_state == "paused"
         if not first or self.training_state != "training":
             raise KeyboardInterrupt
-        print(
-            "stopping after this step; once more to stop at once, without saving it",
-            file=sys.stderr,
-        )
+        say("stopping after this step; once more to stop at once, without saving it", error=True)
 
 
 def all_finite(parameters: list[nn.Parameter]) -> bool:
@@ -305,5 +402,5 @@ def all_finite(parameters: list[nn.Parameter]) -> bool:
 
 def _interrupted(number: int) -> NoReturn:
     """End the program as a signal does, past nerfstudio, which catches KeyboardInterrupt alone."""
-    print("interrupted", file=sys.stderr)
+    say("interrupted", error=True)
     sys.exit(128 + number)

@@ -1,6 +1,5 @@
-"""Making a scene smaller: pruning methods, budgets, SH bands."""
+"""Makes scenes smaller: pruning methods, budgets, SH bands."""
 
-from pointsplat_ns.io.ply import ply_bytes
 from pointsplat_ns.pruning.budget import (
     Keep,
     Megabytes,
@@ -20,6 +19,7 @@ from pointsplat_ns.pruning.methods import (
 )
 from pointsplat_ns.pruning.paper import select
 from pointsplat_ns.pruning.sh_bands import band_energies, cut_sh, energy_lost
+from pointsplat_ns.scene.ply import ply_bytes
 
 __all__ = [
     "METHODS",

@@ -1,5 +1,7 @@
-"""Scores of Gaussians by their own attributes beside the paper's
-(:mod:`~pointsplat_ns.pruning.paper`)."""
+"""Baseline scores from the attributes of Gaussians.
+
+The paper's score is in :mod:`~pointsplat_ns.pruning.paper`.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
 from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT, of_usable, weighted_score
+from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.tensors import DOUBLES
 
 
@@ -20,8 +22,8 @@ def authors_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIG
 
     ``opacity_weight * z(logit) + (1 - opacity_weight) * z(4/3 pi product of (log-scale + 1e-6))``:
     the raw logit in place of alpha, and a product of logarithms in place of the volume. Infinite
-    values are replaced by the largest (smallest) finite one, so that mean and deviation stay
-    finite. Errors as of :func:`~pointsplat_ns.pruning.paper.paper_score`.
+    values become the largest (smallest) finite one, so that mean and deviation stay finite. Errors
+    as of :func:`~pointsplat_ns.pruning.paper.paper_score`.
     """
     return weighted_score(
         scene,
@@ -32,13 +34,13 @@ def authors_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIG
 
 
 def opacity_score(scene: Gaussians) -> Tensor:
-    """Opacity alone: the logit, which ranks like alpha but does not saturate, (N,) float64."""
+    """Opacity logit, (N,) float64; ranks like alpha but does not saturate."""
     return of_usable(scene, lambda part: part.opacities[:, 0].double())
 
 
 def log_area(scene: Gaussians) -> Tensor:
     """Natural logarithm of the product of the two largest standard deviations, squared scene units,
-    (N,) float64. Up to a factor, this is the area seen from the broad side."""
+    (N,) float64: up to a factor, the projected area of the broad side."""
     scales = scene.scales.double()
     return (
         scales.sum(dim=1) - scales.amin(dim=1)
@@ -48,7 +50,7 @@ def log_area(scene: Gaussians) -> Tensor:
 
 
 def random_score(scene: Gaussians) -> Tensor:
-    """Uniform in [0, 1), the same on every device, (N,) float64."""
+    """Uniform in [0, 1), (N,) float64; the same on every device."""
     generator = torch.Generator().manual_seed(0)
     scores = torch.rand(len(scene), generator=generator, **DOUBLES).to(scene.device)
     return torch.where(scene.usable(), scores, math.nan)
@@ -64,17 +66,17 @@ def _within_finite(values: Tensor) -> Tensor:
 
 
 def coverage_score(scene: Gaussians) -> Tensor:
-    """Share of a neighbourhood's mass held by a Gaussian and its neighbours of less mass, (N,)
-    float64 in (0, 1]; NaN for Gaussians that cannot be drawn.
+    """Share of a neighbourhood's mass in a Gaussian and its neighbours of less mass, (N,) float64
+    in (0, 1]; NaN for Gaussians that cannot be drawn.
 
     A score over the whole scene empties regions whose Gaussians are small or faint, even if many of
-    them together form a surface. Here Gaussians compete only with their neighbours, a run of a few
-    along a space-filling curve: small where the scene is dense, large where it is sparse.
+    them together form a surface. Here Gaussians compete only with their neighbours, a short run
+    along a space-filling curve: small in dense regions, large in sparse ones.
 
     In a neighbourhood of masses m_1 >= m_2 >= ... the i-th scores ``1 - (m_1 + ... + m_(i-1)) /
-    (m_1 + ...)``. So a threshold keeps, in each neighbourhood, the fewest Gaussians that hold a
-    given share of its mass; the largest scores 1. The score is the mean over five ways to divide
-    the scene into neighbourhoods of twelve.
+    (m_1 + ...)``. So a threshold keeps, in each neighbourhood, the fewest Gaussians with a given
+    share of its mass; the largest scores 1. The score is the mean over five divisions of the scene
+    into neighbourhoods of twelve.
     """
     return of_usable(scene, _shares_of_neighbourhoods)
 
@@ -82,8 +84,8 @@ def coverage_score(scene: Gaussians) -> Tensor:
 def _shares_of_neighbourhoods(scene: Gaussians) -> Tensor:
     if len(scene) == 0:
         return scene.means.new_zeros(0, dtype=torch.float64)
-    # Measured on three scenes from 8 to 512 in a neighbourhood: fewer are better when 50 % are
-    # kept, and worse at 10 %, where some runs then keep no Gaussian; 12 to 32 differ little.
+    # Measured on three scenes with 8 to 512 Gaussians per neighbourhood: fewer are better if 50 %
+    # are kept, and worse at 10 %, where some runs then keep no Gaussian; 12 to 32 differ little.
     run = 12
 
     # Each curve is shifted by one of these shares of the grid, so that runs have other borders. At
@@ -91,47 +93,45 @@ def _shares_of_neighbourhoods(scene: Gaussians) -> Tensor:
     # The numbers are arbitrary, but not simple fractions.
     offsets = (0.0, 0.137, -0.0713, 0.0529, -0.1811)
 
-    # The root of the area is the geometric mean of the two largest axes. Area itself keeps blobs
-    # and loses detail; powers of 0.25 to 0.65 differ little.
+    # The square root of the area is the geometric mean of the two largest axes. The area itself
+    # keeps blobs and loses detail; powers of 0.25 to 0.65 differ little.
     mass = F.logsigmoid(scene.opacities[:, 0].double()) + 0.5 * log_area(scene)
-    mass = mass.float()  # float32 is enough to compare logarithms of masses, and half the memory
+    mass = mass.float()  # precise enough to compare log-masses, in half the memory
     cells = unit_cells(scene.means)
     scores = torch.zeros_like(mass)
     for i, offset in enumerate(offsets):
         order = curve_keys(cells, offset).argsort(stable=True)
-        first = i * run // len(offsets)  # where the first whole run begins
+        first = i * run // len(offsets)  # start of the first whole run
         scores.index_add_(0, order, mass_shares(mass[order], run, first))
     return scores.double() / len(offsets)
 
 
 def mass_shares(log_mass: Tensor, run: int, first: int) -> Tensor:
-    """For each item of a sequence, the share of its run's mass that it and the run's smaller items
-    hold.
+    """Share of a run's mass in each item and the run's smaller items, for a sequence of items.
 
-    Of two equal items the earlier counts as the larger.
+    Of two equal items, the earlier counts as the larger.
 
     Args:
-        log_mass: (N,) logarithms of the masses, at least one; -Inf is no mass.
+        log_mass: (N,) logarithms of the masses, N at least 1; -Inf is no mass.
         run: number of items in a run.
-        first: where the first whole run begins; the items before it form a run, and so do those
-            left at the end.
+        first: start of the first whole run; the items before it form a run, and so do those left at
+            the end.
 
     Returns:
-        (N,) in [0, 1]; 0 for items without mass. In a run without any mass, all items count as
-        equal.
+        (N,) in [0, 1]; 0 for items without mass. In a run without any mass, all items are equal.
     """
     n = len(log_mass)
     before = -first % run
     padded = F.pad(log_mass, (before, -(n + before) % run), value=math.nan).view(-1, run)
     found = []
     for part in padded.split(2**12):  # fits the processor's cache
-        logs = part.T  # (run, R), NaN where there is no item
+        logs = part.T  # (run, R), NaN for padding
         missing = logs.isnan()
         logs = logs.nan_to_num(nan=-math.inf)
         largest = logs.amax(dim=0)
         empty = largest == -math.inf
         mass = (logs - largest.masked_fill(empty, 0.0)).exp().contiguous()
-        mass += (empty & ~missing).to(mass)  # a run without mass: its items count as equal
+        mass += (empty & ~missing).to(mass)  # a run without mass: its items are equal
         shares = torch.zeros_like(mass)
         for i, item in enumerate(mass):
             shares[: i + 1].addcmul_(item <= mass[: i + 1], item)

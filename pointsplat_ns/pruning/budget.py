@@ -1,4 +1,4 @@
-"""How many Gaussians to keep."""
+"""Budgets: the number of Gaussians to keep."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.gaussians import PLAIN, Traits
-from pointsplat_ns.io.formats import WRITABLE, format_named, format_to_write
+from pointsplat_ns.scene.formats import WRITABLE, format_named, format_to_write
+from pointsplat_ns.scene.gaussians import PLAIN, Traits
 from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_number
 
 KEEP_FORMS = (
@@ -22,8 +22,8 @@ KEEP_FORMS = (
 
 @dataclass(frozen=True)
 class Megabytes:
-    """A budget: the largest size of a file in units of 10^6 bytes, by the suffix of its format.
-    Raises BudgetError if it is not positive, or the format is not written."""
+    """A budget: maximum file size in MB (10^6 bytes), with the suffix of the format. Raises
+    BudgetError if it is not positive, or the format cannot be written."""
 
     value: float
     suffix: str = ".ply"
@@ -39,12 +39,12 @@ class Megabytes:
 
     @property
     def bytes(self) -> int:
-        """The largest size."""
+        """The maximum size."""
         return math.floor(self.value * 1e6)
 
     @property
     def bytes_of(self) -> Callable[[int, int, Traits], int] | None:
-        """Size of a file, bytes, by count, SH degree and traits; None if it is known only after
+        """File size, bytes, from count, SH degree and traits; None if it is known only after
         writing."""
         return format_to_write(self.suffix).bytes_of
 
@@ -54,9 +54,8 @@ class Megabytes:
 
 @dataclass(frozen=True)
 class WithinPsnr:
-    """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene's
-    own, with numbers rounded for the format with a suffix. Raises BudgetError if it is not
-    positive."""
+    """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene, with
+    numbers rounded for the format of a suffix. Raises BudgetError if it is not positive."""
 
     value: float
     suffix: str = ".ply"
@@ -72,24 +71,24 @@ class WithinPsnr:
 
 
 class BareCount(int):
-    """A count that was typed as digits alone, such as 10: it may be meant as a percentage."""
+    """A count typed as digits alone, such as 10, which may be meant as a percentage."""
 
 
 Keep = float | int | Megabytes | WithinPsnr
 
 
 def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = PLAIN) -> int:
-    """The number of Gaussians that a budget means for a scene of ``n``.
+    """Number of Gaussians for a budget and a scene of ``n``.
 
     The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and
-    ``1`` keeps one Gaussian. A ratio gives the nearest count, and at least one. A size gives as
-    many as fit into the file.
+    ``1`` keeps one Gaussian. A ratio gives the nearest count, and at least one. A size gives the
+    largest count that fits.
 
     Args:
         n: number of Gaussians in the scene.
         keep: float ratio in (0, 1], int count from 1 on, :class:`Megabytes`, or any of them as
             text.
-        sh_degree, traits: of the scene that will be written; only a size depends on them.
+        sh_degree, traits: of the scene to write; used only for a size.
 
     Returns:
         The count, in 1..n.
@@ -106,12 +105,12 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
         keep = parse_keep(keep)
     if isinstance(keep, WithinPsnr):
         raise BudgetError(
-            "keep is auto, which is found by rendering; expected a ratio, a count or a size here"
+            "keep is auto, which needs rendering; expected a ratio, a count or a size here"
         )
     if isinstance(keep, bool) or not isinstance(keep, (Megabytes, Real)):
         raise BudgetError(f"keep is {keep!r}; {KEEP_FORMS}")
     if n < 1:
-        raise BudgetError(f"keep is {keep} but the scene holds no Gaussians; expected at least one")
+        raise BudgetError(f"keep is {keep} but the scene has no Gaussians; expected at least one")
     if isinstance(keep, Megabytes):
         return _count_that_fits(n, keep, sh_degree, traits)
     if isinstance(keep, Integral):
@@ -120,7 +119,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
         if isinstance(keep, BareCount) and keep < 100 and n >= 5000:
             raise BudgetError(
                 f"keep is {int(keep)}, of {n:,} Gaussians; did you mean {int(keep)}%? Write "
-                f"{int(keep)}gaussians for so few"
+                f"{int(keep)}gaussians if you mean that count"
             )
         return min(int(keep), n)
     if not 0 < keep <= 1:  # NaN fails too
@@ -129,21 +128,21 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
 
 
 def found_by_trying(keep: Keep) -> bool:
-    """Whether the count of a budget is found only by trials: of a PSNR, or of the size of a
+    """Whether the count of a budget is found only by trials: for a PSNR, or for the size of a
     compressed file."""
     return isinstance(keep, WithinPsnr) or isinstance(keep, Megabytes) and keep.bytes_of is None
 
 
 def _count_that_fits(n: int, keep: Megabytes, sh_degree: int, traits: Traits) -> int:
-    """Largest number of Gaussians, at most ``n``, whose file is no larger than the budget."""
+    """Largest number of Gaussians, at most ``n``, whose file is within the budget."""
     bytes_of = keep.bytes_of
     if bytes_of is None:
         raise BudgetError(
-            f"keep is {keep}, which is found by writing; expected a ratio, a count or the size of "
-            "a .ply here"
+            f"keep is {keep}, which needs writing; expected a ratio, a count or the size of a .ply "
+            "here"
         )
-    # The size never falls with the count, but grows unevenly: headers hold its digits, and chunks
-    # are padded.
+    # The size never decreases with the count, but grows unevenly: headers contain the count, and
+    # chunks are padded.
     count = bisect.bisect_right(
         range(1, n + 1), keep.bytes, key=lambda count: bytes_of(count, sh_degree, traits)
     )
@@ -157,18 +156,19 @@ def _count_that_fits(n: int, keep: Megabytes, sh_degree: int, traits: Traits) ->
 
 
 def parse_keep(text: str, suffix: str = ".ply") -> Keep:
-    """Parse a budget: ``0.3`` and ``30%`` are ratios; ``50000``, ``50k`` and ``12 Gaussians`` are
-    counts; ``12MB`` and ``800kB.spz`` are sizes; ``auto``, ``auto:35`` and ``auto:35.sog`` are the
-    PSNR (dB) that renders must reach against the dense scene. A size or a PSNR without a format is
-    for files with ``suffix``.
+    """Parse a budget.
+
+    ``0.3`` and ``30%`` are ratios; ``50000``, ``50k`` and ``12 Gaussians`` are counts; ``12MB`` and
+    ``800kB.spz`` are sizes; ``auto``, ``auto:35`` and ``auto:35.sog`` are the PSNR (dB) of renders
+    against the dense scene. A size or a PSNR without a format is for files with ``suffix``.
 
     Raises:
-        BudgetError: if it is none of these. The range of a ratio or count is checked by
+        BudgetError: for any other text. The range of a ratio or count is checked by
             :func:`resolve_keep`.
 
     Example:
-        >>> parse_keep("30%"), parse_keep("50000"), parse_keep("1"), parse_keep("1.0"), parse_keep("12MB")
-        (0.3, 50000, 1, 1.0, Megabytes(value=12.0, suffix='.ply'))
+        >>> [parse_keep(text) for text in ("30%", "50000", "1", "1.0")], parse_keep("12MB")
+        ([0.3, 50000, 1, 1.0], Megabytes(value=12.0, suffix='.ply'))
     """
     text = text.strip()
     try:

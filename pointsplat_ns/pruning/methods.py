@@ -1,4 +1,4 @@
-"""The registry of pruning methods, and :func:`prune`, which applies one of them."""
+"""The registry of pruning methods, and :func:`prune`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.merging import merge
 from pointsplat_ns.pruning.baselines import (
     authors_score,
     coverage_score,
@@ -20,9 +17,12 @@ from pointsplat_ns.pruning.baselines import (
     random_score,
 )
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
+from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.pruning.paper import paper_score, select
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
-from pointsplat_ns.views import Views
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.view_sampling.sampler import Sampler
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ METHODS: dict[str, Method] = {
         Method("pup", pup_score, needs_views=True),
     )
 }
-"""All methods by name, the best first."""
+"""All methods by name, best first."""
 
 
 def method_named(by: str, opacity_weight: float | None = None) -> Method:
-    """The method called ``by``. Raises PointSplatError if there is none, or it has no opacity
-    weight but is given one."""
+    """The method called ``by``. Raises PointSplatError if it is unknown, or gets an opacity weight
+    that it does not use."""
     if by not in METHODS:
         raise PointSplatError(f"no method is called {by!r}; expected one of {', '.join(METHODS)}")
     if opacity_weight is not None and not METHODS[by].weighs_opacity:
@@ -71,15 +71,15 @@ def method_named(by: str, opacity_weight: float | None = None) -> Method:
 
 @dataclass(frozen=True)
 class PruneSettings:
-    """Pruning settings that apply to many scenes, as in training. Raises BudgetError if ``keep`` is
-    neither a ratio nor a count, and PointSplatError if the method needs views, or for what
-    :func:`method_named` refuses."""
+    """Pruning settings for many scenes, as in training. Raises BudgetError if ``keep`` is neither a
+    ratio nor a count, and PointSplatError if the method needs views, or as
+    :func:`method_named`."""
 
     keep: float | int
     """Ratio (float, at most 1) or count (int)."""
     by: str = "merge"
     opacity_weight: float | None = None
-    """Lambda of the methods that weigh opacity; None is the paper's."""
+    """Lambda of the methods that weigh opacity; None for the paper's value."""
 
     def __post_init__(self) -> None:
         keep = self.keep
@@ -88,11 +88,11 @@ class PruneSettings:
                 f"keep is {keep:g}; expected a ratio above 0 and up to 1 (such as 0.3) or a whole "
                 "number of Gaussians (such as 50000)"
             )
-        if keep > 1:  # configuration files write counts as floats
+        if keep > 1:  # configuration files have floats for counts
             object.__setattr__(self, "keep", int(keep))
         if method_named(self.by, self.opacity_weight).needs_views:
             raise PointSplatError(
-                f"{self.by} looks at a scene from poses; expected a method that needs none"
+                f"{self.by} needs views of the scene; expected a method that needs none"
             )
 
     def prune(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Gaussians:
@@ -117,8 +117,8 @@ def prune(
         keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
         by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original
             order.
-        views: views for methods that need them. Merging uses views or a sampler; for None it
-            samples views of its own.
+        views: for methods that need them. Merging uses views or a sampler; for None it samples its
+            own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
 
@@ -126,10 +126,10 @@ def prune(
         Exactly the number of Gaussians that ``keep`` resolves to.
 
     Raises:
-        BudgetError: if ``keep`` does not fit the scene.
+        BudgetError: if ``keep`` is out of range for the scene.
         SceneError: if no Gaussian of the scene can be drawn.
-        DataError: if the method needs views and there are none.
-        PointSplatError: if there is no such method, or it has no opacity weight but is given one.
+        DataError: if the method needs views and none are given.
+        PointSplatError: if the method is unknown, or gets an opacity weight that it does not use.
     """
     method = method_named(by, opacity_weight)
     count = resolve_keep(len(scene), keep, scene.sh_degree, scene.traits)
@@ -148,12 +148,12 @@ def score_of(
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Tensor:
-    """Scores (N,) float64 of a scene by a method that has a score; arguments as for :func:`prune`,
-    and ``views`` may be a function that returns them."""
+    """Scores (N,) float64 of a scene by a method with a score; arguments as for :func:`prune`.
+    ``views`` may be a function that returns them."""
     assert method.score is not None, f"{method.name} has no score"
     if method.needs_views:
         if views is None:
-            raise DataError(f"{method.name} looks at the scene from poses; expected views")
+            raise DataError(f"{method.name} needs views of the scene; expected views")
         return method.score(scene, views() if callable(views) else views, progress=progress)
     if opacity_weight is not None:
         return method.score(scene, opacity_weight=opacity_weight)

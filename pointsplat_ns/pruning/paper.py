@@ -1,9 +1,8 @@
-"""The paper's pruning ("Geometry-Driven Pruning Score", eq. 3): a score from opacity and volume,
-and its K highest.
+"""The paper's pruning ("Geometry-Driven Pruning Score", eq. 3): a score of opacity and volume.
 
-A score is a function of the scene and returns (N,) float64 on the scene's device: the higher, the
-more worth keeping. Gaussians that cannot be drawn score NaN and are left out of the statistics of
-the others. Scores are computed from logarithms and logits in float64, so that nothing overflows.
+A score is a function of the scene and returns (N,) float64 on the scene's device; the highest are
+kept. Gaussians that cannot be drawn score NaN and are excluded from the statistics of the others.
+Scores are computed from logarithms and logits in float64, so that nothing overflows.
 """
 
 from __future__ import annotations
@@ -15,19 +14,21 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError, PointSplatError
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.scene.gaussians import Gaussians
 
 DEFAULT_OPACITY_WEIGHT = 0.3
-"""Lambda of eq. 3; the paper uses the same value for every data set."""
+"""Lambda of eq. 3; the paper uses one value for all data sets."""
 
 
 class ScoreError(PointSplatError, ValueError):
-    """An option that a score cannot work with."""
+    """An invalid option of a score."""
 
 
 def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT) -> Tensor:
-    """Eq. 3: ``opacity_weight * z(alpha) + (1 - opacity_weight) * z(4/3 pi sx sy sz)``, with
-    z-scores over the scene.
+    """The paper's score: weighted z-scores of opacity and volume.
+
+    Eq. 3: ``opacity_weight * z(alpha) + (1 - opacity_weight) * z(4/3 pi sx sy sz)``, with z-scores
+    over the scene.
 
     Args:
         scene: N Gaussians.
@@ -53,7 +54,7 @@ def weighted_score(
     opacity_of: Callable[[Gaussians], Tensor],
     size_of: Callable[[Gaussians], Tensor],
 ) -> Tensor:
-    """Eq. 3 of any opacity and size, each (N,); arguments and errors as for :func:`paper_score`."""
+    """Eq. 3 for any opacity and size, each (N,); arguments and errors as :func:`paper_score`."""
     if not 0 <= opacity_weight <= 1:  # NaN fails too
         raise ScoreError(f"opacity_weight is {opacity_weight}; expected 0 to 1")
     return of_usable(
@@ -67,7 +68,8 @@ def weighted_score(
 def zscore(values: Tensor) -> Tensor:
     """The paper's nu: ``(values - mean) / std`` in float64, (N,); zero if all values are the same.
 
-    The standard deviation divides by N; N - 1 would scale all scores alike and change no ranking.
+    The standard deviation divides by N; N - 1 would scale all scores alike and not change the
+    ranking.
     """
     values = values.double()
     if values.numel() == 0 or values.max() == values.min():
@@ -83,8 +85,8 @@ def log_volume(scene: Gaussians) -> Tensor:
 
 
 def _relative_volume(scene: Gaussians) -> Tensor:
-    """Volumes relative to the largest, in [0, 1], (N,) float64. Their z-scores are those of the
-    volumes, and nothing overflows."""
+    """Volumes relative to the largest, in [0, 1], (N,) float64: they have the z-scores of the
+    volumes, without overflow."""
     logs = log_volume(scene)
     largest = logs.max() if len(scene) else -math.inf
     return torch.exp(logs - largest) if largest > -math.inf else torch.zeros_like(logs)
@@ -104,7 +106,7 @@ def select(scores: Tensor, k: int) -> Tensor:
     """Indices (k,) int64, ascending, of the ``k`` highest scores (N,), of any floating type, +-Inf
     allowed.
 
-    Of equal scores, the lower index is taken first; NaN ranks below every number.
+    Of equal scores, lower indices come first; NaN ranks below every number.
 
     Raises:
         BudgetError: if ``k`` is not in 0..N.
@@ -127,7 +129,7 @@ def select(scores: Tensor, k: int) -> Tensor:
 
 
 def _first(mask: Tensor, count: int) -> Tensor:
-    """``mask`` (N,) with only its first ``count`` true entries left true."""
+    """``mask`` (N,) reduced to its first ``count`` true entries."""
     left = torch.zeros_like(mask)
     left[mask.nonzero()[:count, 0]] = True
     return left

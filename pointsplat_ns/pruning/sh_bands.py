@@ -1,9 +1,9 @@
-"""Cutting the bands of spherical harmonics (SH), and the energy that is lost by it.
+"""Cuts spherical harmonics (SH) bands, and computes the energy lost.
 
 The basis is orthonormal on the sphere: the mean square, over all directions, of a coefficient's
-contribution to a colour is its square divided by 4 pi. So the energy lost is known without
-rendering. The visible error is not, as a scene is seen from some directions only: it was up to 9 dB
-away from the energy's prediction.
+contribution to a colour is its square divided by 4 pi. So the lost energy needs no rendering. It
+does not predict the visible error, because a scene is seen from some directions only: PSNR differed
+by up to 9 dB.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import math
 import torch
 import torch.nn.functional as F
 
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.baselines import log_area
+from pointsplat_ns.scene.gaussians import Gaussians
 
 
 def band_energies(scene: Gaussians) -> list[float]:
-    """Mean square of what each SH band adds to the colours: one number for each degree from 1 to
+    """Mean square of each SH band's contribution to the colours: one number per degree from 1 to
     the scene's.
 
     The mean is over all directions, over the channels, and over the Gaussians weighted by alpha
-    times area. Gaussians that cannot be drawn are left out; the clamping of colours at 0 is
+    times area. Gaussians that cannot be drawn are excluded; the clamping of colours at 0 is
     ignored.
     """
     weights = F.logsigmoid(scene.opacities[:, 0].double()) + log_area(scene)
@@ -30,17 +30,16 @@ def band_energies(scene: Gaussians) -> list[float]:
     if not bool(drawn.any()):
         return [0.0] * scene.sh_degree
     weights = torch.softmax(weights[drawn], dim=0)
-    squares = (
-        weights @ scene.features_rest[drawn].double().square().mean(dim=2) / (4 * math.pi)
-    )  # (K,)
+    # (K,)
+    squares = weights @ scene.features_rest[drawn].double().square().mean(dim=2) / (4 * math.pi)
     return [
         float(squares[d * d - 1 : (d + 1) ** 2 - 1].sum()) for d in range(1, scene.sh_degree + 1)
     ]
 
 
 def energy_lost(scene: Gaussians, degree: int) -> float:
-    """Share of the view-dependent energy (:func:`band_energies`) that is lost if a scene is cut to
-    an SH degree, in [0, 1]; 0 if there is none to lose."""
+    """Share of the view-dependent energy (:func:`band_energies`) lost by cutting a scene to an SH
+    degree, in [0, 1]; 0 if there is no such energy."""
     energies = band_energies(scene)
     total = sum(energies)
     return sum(energies[degree:]) / total if total > 0 else 0.0

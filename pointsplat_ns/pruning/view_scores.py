@@ -1,6 +1,6 @@
 """Scores from views of a scene: the image-driven baselines of the paper's Table 1.
 
-Both need poses but no photos. They are exact sums over every pixel of every view.
+Both need poses but no photos. They are exact sums over all pixels of all views.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.paper import log_volume
-from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
-from pointsplat_ns.rasterizer.projection import Projected, project_scene
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
+from pointsplat_ns.rendering.pixel_walk import PixelBlock, sum_over_pixels
+from pointsplat_ns.rendering.projection import Projected, project_scene
+from pointsplat_ns.rendering.spherical_harmonics import sh_to_color
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system.tensors import FLOATS
-from pointsplat_ns.views import View, Views
 
 
 def lightgaussian_score(
@@ -28,7 +28,7 @@ def lightgaussian_score(
 
     ``sum over all pixels of 1(hit) * opacity * T``, times ``min(V / V_90, 1) ** 0.1``: T is the
     transmittance in front of the Gaussian at that pixel, V its volume, and V_90 the volume at 90 %
-    of all volumes in descending order. The authors' released code leaves out T and the clamp at 1.
+    of all volumes in descending order. The authors' released code omits T and the clamp at 1.
 
     Args:
         scene: N Gaussians.
@@ -36,13 +36,13 @@ def lightgaussian_score(
         progress: called with the share done, in [0, 1].
 
     Returns:
-        Scores (N,), float64; zero where no view sees the Gaussian, NaN where it cannot be drawn.
+        Scores (N,), float64; zero for invisible Gaussians, NaN for those that cannot be drawn.
 
     Raises:
         DataError: if there is no view.
     """
     usable = scene.usable()
-    scene = scene.to(torch.promote_types(scene.dtype, torch.float32))  # as the rasterizer does
+    scene = scene.to(torch.promote_types(scene.dtype, torch.float32))  # as in the rasterizer
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
 
     def passed(block: PixelBlock) -> Tensor:
@@ -68,22 +68,21 @@ def pup_score(
     """PUP-3DGS's spatial sensitivity (arXiv 2406.10219, section 3.1).
 
     ``log det H`` with ``H = sum over views, pixels and channels of g g^T``, the Gauss-Newton
-    Hessian of the squared error of the picture, where g is the gradient of a pixel's channel by the
-    mean (3) and the log-scales (3) of the Gaussian, as in the authors' released code. It is exact
-    and includes the change of colour with the viewing direction; values clamped at black or at the
-    maximum of alpha have no gradient. The authors take the picture at a quarter of its width; here
-    the views' own size counts.
+    Hessian of the image's squared error, where g is the gradient of a pixel's channel by the
+    Gaussian's mean (3) and log-scales (3), as in the authors' released code. It is exact and
+    includes the change of colour with the viewing direction; values clamped at black or at the
+    maximum of alpha have no gradient. The authors render at a quarter of the image width; here the
+    views' own size is used.
 
     Args:
         scene: N Gaussians.
-        views: at least one view; the image size decides how fine the sensitivity is.
+        views: at least one view; the image size determines the resolution of the sensitivity.
         progress: called with the share done, in [0, 1].
 
     Returns:
-        Scores (N,), float64: -Inf where the picture does not depend on one of the six parameters
-        (as where no view sees the Gaussian), NaN where it cannot be drawn. Combinations of
-        parameters that no view determines count as slightly determined, see
-        :func:`log_determinant`.
+        Scores (N,), float64: -Inf if the image does not depend on one of the six parameters (for
+        example for invisible Gaussians), NaN for Gaussians that cannot be drawn. Parameter
+        combinations that no view determines get a small eigenvalue, see :func:`log_determinant`.
 
     Raises:
         DataError: if there is no view.
@@ -94,9 +93,9 @@ def pup_score(
 def sensitivity(
     scene: Gaussians, views: Views, progress: Callable[[float], None] | None = None
 ) -> Tensor:
-    """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64: by the mean (world, scene
-    units), then by the log-scales."""
-    # In float32, small eigenvalues, and so the scores of Gaussians that few pixels show, are
+    """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64, over the mean (world, scene
+    units) and the log-scales."""
+    # In float32, small eigenvalues, and so the scores of Gaussians that cover few pixels, are
     # rounding errors. In a room a quarter of the better half differed from float64.
     scene = scene.to(torch.float64).detach()
     total = torch.zeros(len(scene), 6, 6, dtype=torch.float64, device=scene.device)
@@ -129,18 +128,18 @@ def sensitivity(
 
 def log_determinant(blocks: Tensor) -> Tensor:
     """Logarithm of the determinants of symmetric positive semi-definite blocks, (N, D, D) to (N,);
-    -Inf where the diagonal has a zero.
+    -Inf if the diagonal has a zero.
 
     Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or
-    overflows. Its eigenvalues count as at least 1e-9: parameters that no view determines have
-    eigenvalues of 0, whose computed values and logarithms are rounding errors. So the result
-    depends on the other eigenvalues.
+    overflows. Eigenvalues are clamped at 1e-9: parameters that no view determines have eigenvalues
+    of 0, whose computed logarithms would be rounding errors. So the result depends on the other
+    eigenvalues.
     """
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
     ok = (diagonal > 0).all(-1) & blocks.isfinite().all(-1).all(-1)
     root = torch.where(ok[:, None], diagonal, 1.0).sqrt()
     unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1], **FLOATS).to(blocks))
-    # on the CPU: what torch's linear algebra on a GPU is made of differs between machines
+    # on the CPU: torch's linear algebra libraries for GPUs differ between machines
     values = torch.linalg.eigvalsh((unit / root[:, :, None] / root[:, None, :]).cpu()).to(
         root.device
     )
@@ -150,8 +149,8 @@ def log_determinant(blocks: Tensor) -> Tensor:
 
 def _second_moments(projected: Projected, colors: Tensor, view: View) -> Tensor:
     """(M, 55): for the gradient ``r phi`` of a channel by (log opacity, mean x, y, covariance xx,
-    xy, yy), with r its gradient by log alpha, and the weight w of the colour: sums of r^2 phi
-    phi^T, of r w phi (by channel), of w^2."""
+    xy, yy), with r its gradient by log alpha, and the colour's weight w: sums of r^2 phi phi^T, of
+    r w phi (by channel), of w^2."""
     background = view.background.to(colors)
 
     def values(block: PixelBlock) -> Tensor:
@@ -159,9 +158,8 @@ def _second_moments(projected: Projected, colors: Tensor, view: View) -> Tensor:
         shade = colors[block.ids]  # (B, L, 3)
         x = block.gx
         y = block.gy
-        phi = torch.stack(
-            [torch.ones_like(weight), x, y, 0.5 * x * x, x * y, 0.5 * y * y], dim=-2
-        )  # (B, L, 6, 64)
+        # (B, L, 6, 64)
+        phi = torch.stack([torch.ones_like(weight), x, y, 0.5 * x * x, x * y, 0.5 * y * y], dim=-2)
         steep = block.alpha / (1 - block.alpha)
         square = torch.zeros_like(weight)
         cross = []

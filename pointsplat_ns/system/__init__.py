@@ -1,1 +1,1 @@
-"""Progress bars and memory settings."""
+"""Files, processes, threads, memory, compiled kernels and progress bars."""

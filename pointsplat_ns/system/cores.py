@@ -1,4 +1,4 @@
-"""The cores that this process may use, and those that other programs leave to it."""
+"""CPU cores that this process may use, and those that other programs occupy."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 
 
 def cores() -> int:
-    """Number of cores that this process may use: as its affinity and the quotas of its control
-    groups (those of a container, for one) allow."""
+    """Number of cores that this process may use, limited by its affinity and by the quotas of its
+    control groups, such as those of a container."""
     return max(1, int(min(len(_allowed()), cpu_quota())))
 
 
 def _allowed() -> list[int]:
-    """Numbers of the cores that this process may be scheduled on."""
+    """Indices of the cores that this process may be scheduled on."""
     return (
         sorted(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")
@@ -26,8 +26,8 @@ def _allowed() -> list[int]:
 
 
 def _usage() -> tuple[float, float, int, float]:
-    """Seconds of the clock, and of this process on cores; the number of cores that it may be
-    scheduled on, and the seconds used of them by all programs, 0 if they are unknown."""
+    """Wall-clock seconds; CPU seconds of this process; number of cores that it may be scheduled on;
+    seconds of use of these cores by all programs, 0 if unknown."""
     import psutil
 
     allowed = _allowed()
@@ -35,24 +35,23 @@ def _usage() -> tuple[float, float, int, float]:
         times = psutil.cpu_times(percpu=True)
     except (OSError, psutil.Error):
         times = []
-    seen = [
-        times[number] for number in allowed if number < len(times)
-    ]  # a container may be shown fewer
-    # Time of guests is part of the user time, too.
+    # a container may see fewer cores
+    seen = [times[number] for number in allowed if number < len(times)]
+    # User time includes guest time.
     not_busy = ("idle", "iowait", "guest", "guest_nice")
     busy = sum(sum(each) - sum(getattr(each, name, 0.0) for name in not_busy) for each in seen)
     return time.monotonic(), time.process_time(), len(seen) or len(allowed), busy
 
 
 class OtherPrograms:
-    """Measures the mean number of cores that other programs take from this process from now on."""
+    """Measures the mean number of cores that other programs occupy, from its construction on."""
 
     def __init__(self) -> None:
         self.before = _usage()
 
     def cores(self) -> float:
-        """Mean number of cores, at most :func:`cores`. What others use of a machine counts only
-        where the rest is less than a quota allows this process."""
+        """Mean number of cores, at most :func:`cores`. Use by others counts only if it leaves fewer
+        cores than this process's quota."""
         (start, own_before, _, before) = self.before
         (end, own_after, limit, after) = _usage()
         others = max(0.0, after - before - (own_after - own_before)) / max(end - start, 1e-9)
@@ -61,8 +60,9 @@ class OtherPrograms:
 
 @functools.cache
 def cpu_quota(root: Path = Path("/")) -> float:
-    """Number of cores that Linux's control groups (version 2) allow this process, the least of its
-    group and all above; infinite if there is no limit. ``proc`` and ``sys`` are below ``root``."""
+    """Number of cores that Linux control groups (version 2) allow this process: the minimum over
+    its group and the groups above; infinite if unlimited. ``proc`` and ``sys`` are below
+    ``root``."""
     try:
         lines = (root / "proc/self/cgroup").read_text("utf-8").splitlines()
     except OSError:
@@ -72,7 +72,7 @@ def cpu_quota(root: Path = Path("/")) -> float:
     for line in lines:
         if line.startswith("0::/"):
             folder = top / line[4:]
-            # In a container, the group may be named as the host sees it, and be mounted as the top.
+            # A container may see the host's group name, with the group mounted at the top.
             for each in (folder, *folder.parents):
                 with suppress(OSError, ValueError, ZeroDivisionError):  # "max": no limit
                     quota, period = (each / "cpu.max").read_text("utf-8").split()

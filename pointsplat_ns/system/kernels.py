@@ -1,9 +1,8 @@
-"""Functions of the C++ files of this package: built when the package is installed, and called on
-several threads.
+"""Calls the package's C++ functions, which are compiled at installation, on several threads.
 
-Structs and functions are read from the files and their headers, so that nothing is declared twice.
-Files share what is between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs
-of numbers, arrays, pointers and earlier structs.
+A module that calls a kernel declares it: the structs that it takes as classes (:class:`Struct`),
+the function with the types of its arguments (:class:`Function`). Tests compare the declarations
+with those of the C++ files by a compiler.
 """
 
 from __future__ import annotations
@@ -11,9 +10,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import logging
-import math
 import os
-import re
 import threading
 import warnings
 from collections.abc import Callable
@@ -23,30 +20,22 @@ from typing import Any, ClassVar
 
 import torch
 
-from pointsplat_ns.system.native import IS_X86, cpp_files, library_path
+from pointsplat_ns.system.native import IS_X86, library_path
 from pointsplat_ns.system.threads import most_threads, pool
 
 logger = logging.getLogger("pointsplat_ns")
 
-_NUMBERS = {
-    "int": (ctypes.c_int, None),
-    "int32_t": (ctypes.c_int32, torch.int32),
-    "int64_t": (ctypes.c_int64, torch.int64),
-    "float": (ctypes.c_float, torch.float32),
-    "double": (ctypes.c_double, torch.float64),
-}
-
 
 class Pointer:
     """Type of a pointer, which takes contiguous tensors on the CPU, of one dtype or of any,
-    structs, addresses and None."""
+    addresses and None."""
 
     def __init__(self, dtype: torch.dtype | None):
         self.dtype = dtype
 
     def address(self, value: Any) -> int | None:
-        """The address of a tensor; None and addresses as they are. Raises TypeError if the tensor
-        has another dtype or device, or is not contiguous."""
+        """Address of a tensor; None and addresses are returned unchanged. Raises TypeError if the
+        tensor has another dtype or device, or is not contiguous."""
         if not isinstance(value, torch.Tensor):
             return value
         if self.dtype not in (None, value.dtype) or not value.is_cpu or not value.is_contiguous():
@@ -57,18 +46,35 @@ class Pointer:
         return value.data_ptr()
 
     def from_param(self, value: Any) -> Any:
-        """What ctypes passes for an argument."""
+        """Value that ctypes passes for an argument."""
         if value is None or isinstance(value, (int, torch.Tensor)):
             return ctypes.c_void_p(self.address(value))
-        return ctypes.byref(value) if isinstance(value, Struct) else value
+        return value
+
+
+FLOAT_POINTER = Pointer(torch.float32)
+DOUBLE_POINTER = Pointer(torch.float64)
+INT32_POINTER = Pointer(torch.int32)
+INT64_POINTER = Pointer(torch.int64)
+ANY_POINTER = Pointer(None)
+"""Of structs, in a tensor of bytes."""
+
+
+def c_fields(members: dict[str, Any]) -> list[tuple[str, Any]]:
+    """The ``_fields_`` of a struct with these members."""
+    return [
+        (name, ctypes.c_void_p if isinstance(kind, Pointer) else kind)
+        for name, kind in members.items()
+    ]
 
 
 class Struct(ctypes.Structure):
-    """A struct of a C++ file. :meth:`fill` sets pointers to what :class:`Pointer` takes, and keeps
-    tensors alive."""
+    """A struct of a C++ file. A subclass lists its members in ``members``, in the order of the
+    file, and has ``_fields_ = c_fields(members)``; arrays are flat. :meth:`fill` sets pointers to
+    what :class:`Pointer` takes, and keeps tensors alive."""
 
-    __slots__ = ("kept",)
-    pointers: ClassVar[dict[str, Pointer]] = {}
+    members: ClassVar[dict[str, Any]] = {}
+    """Types of the members by name: a type of ctypes, another struct, or a :class:`Pointer`."""
 
     def __init__(self, **values: Any):
         self.kept: dict[str, Any] = {}
@@ -77,126 +83,90 @@ class Struct(ctypes.Structure):
     def fill(self, **values: Any) -> None:
         """Set fields. Raises AttributeError if there is no such field, and TypeError if a value
         does not fit its type."""
+        unknown = values.keys() - self.members.keys()
+        if unknown:
+            raise AttributeError(f"{type(self).__name__} has no member {sorted(unknown)[0]}")
         self.kept.update(values)
-        pointers = self.pointers
         for name, value in values.items():
-            setattr(self, name, pointers[name].address(value) if name in pointers else value)
+            kind = self.members[name]
+            setattr(self, name, kind.address(value) if isinstance(kind, Pointer) else value)
+
+    @classmethod
+    def from_param(cls, value: Any) -> Any:
+        """What ctypes passes for an argument: the address of a struct of this class. Raises
+        TypeError for anything else."""
+        if not isinstance(value, cls):
+            raise TypeError(f"{type(value).__name__}; expected {cls.__name__}")
+        return ctypes.byref(value)
 
 
-def structs_of(text: str) -> dict[str, type[Struct]]:
-    """The structs that the text of a C++ file shares, by name. Raises ValueError if a field is of
-    an unknown type."""
-    found: dict[str, type[Struct]] = {}
-    for name, body in re.findall(r"^struct (\w+) \{\n(.*?)^\};", _shared(text), re.M | re.S):
-        declared = [
-            each
-            for statement in body.split(";")
-            if statement.strip()
-            for each in _declared(statement, found)
-        ]
-        pointers = {field: kind for field, kind in declared if isinstance(kind, Pointer)}
-        fields = [
-            (field, ctypes.c_void_p if field in pointers else kind) for field, kind in declared
-        ]
-        found[name] = type(
-            name, (Struct,), {"__slots__": (), "pointers": pointers, "_fields_": fields}
-        )
-    return found
+FUNCTIONS: dict[str, Function] = {}
+"""All that are declared, by name."""
 
 
-def functions_of(text: str, structs: dict[str, type[Struct]]) -> dict[str, tuple[Any, list[Any]]]:
-    """Type of the result and types of the arguments of the functions that the text of a C++ file
-    shares, by name, given its structs. Raises ValueError if a type is unknown."""
-    found = {}
-    for result, name, parameters in re.findall(r"^(\w+) (\w+)\(([^)]*)\) \{", _shared(text), re.M):
-        kinds = [
-            kind
-            for each in filter(None, parameters.split(","))
-            for _, kind in _declared(each, structs)
-        ]
-        found[name] = None if result == "void" else _NUMBERS[result][0], kinds
-    return found
+class Function:
+    """A function of a C++ file, found in the library when it is first called.
 
+    Args:
+        name: its name in the file.
+        arguments: types of its arguments: types of ctypes, :class:`Pointer`, and classes of
+            structs, which it takes by address.
+        result: type of its result; None if it has none.
+    """
 
-def _shared(text: str) -> str:
-    """What a C++ file shares, without comments."""
-    return re.sub(
-        r"//.*",
-        "",
-        "\n".join(re.findall(r'^extern "C" \{\n(.*?)^\}  // extern "C"', text, re.M | re.S)),
-    )
+    def __init__(self, name: str, *arguments: Any, result: Any = None):
+        self.name = name
+        self.arguments = arguments
+        self.result = result
+        FUNCTIONS[name] = self
 
+    @functools.cached_property
+    def _loaded(self) -> Callable[..., Any]:
+        function = getattr(KERNELS.library, self.name)
+        function.restype = self.result
+        function.argtypes = self.arguments
+        return function
 
-def _declared(statement: str, structs: dict[str, type[Struct]]) -> list[tuple[str, Any]]:
-    """Names and types that a statement such as ``const float *a, b[3]`` declares; arrays are
-    flat."""
-    found: list[tuple[str, Any]] = []
-    base, declarators = re.sub(r"^\s*(const )?", "", statement).split(None, 1)
-    if base.endswith("*"):
-        base = base[:-1]
-        declarators = f"*{declarators}"
-    number: Any
-    number, dtype = (structs[base], None) if base in structs else _NUMBERS.get(base, (None, None))
-    for declarator in declarators.split(","):
-        parts = re.fullmatch(r"\s*(\*?)\s*(\w+)((?:\[\d+\])*)\s*", declarator)
-        if not parts or number is None:
-            raise ValueError(
-                f"{statement!r}: not a declaration of numbers, arrays, pointers or structs"
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function. Raises TypeError if the number or a type of the arguments is wrong,
+        and OSError if the library was not built."""
+        if len(arguments) != len(self.arguments):  # ctypes lets more pass
+            raise TypeError(
+                f"{self.name}: {len(arguments)} arguments; expected {len(self.arguments)}"
             )
-        sizes = [int(size) for size in re.findall(r"\d+", parts[3])]
-        found.append(
-            (
-                parts[2],
-                Pointer(dtype) if parts[1] else number * math.prod(sizes) if sizes else number,
-            )
-        )
-    return found
+        return self._loaded(*arguments)
 
 
 SEVERAL = 4000
-"""Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
+"""Gaussians, or pairs of Gaussian and tile, above which several threads are faster than one."""
 
 
 class Kernels:
-    """Functions of the C++ files that are faster than torch. All are used or none, because results
-    would else be rounded by the one here and by torch there.
+    """The compiled functions. Either all or none are used, because the kernels and torch round
+    differently.
 
     Args:
-        path: their library, which an installation builds.
+        path: the library, built at installation.
     """
 
     def __init__(self, path: Path):
         self._path = path
 
     @functools.cached_property
-    def _text(self) -> str:
-        return "".join(path.read_text("utf-8") for path in (*cpp_files("*.h"), *cpp_files()))
-
-    @functools.cached_property
-    def structs(self) -> dict[str, type[Struct]]:
-        """The structs that the functions take, by name."""
-        return structs_of(self._text)
-
-    @functools.cached_property
     def library(self) -> ctypes.CDLL:
         """The functions. Raises OSError if they were not built."""
-        library = ctypes.CDLL(str(self._path))
-        for name, (result, parameters) in functions_of(self._text, self.structs).items():
-            function = getattr(library, name)
-            function.restype = result
-            function.argtypes = parameters
-        return library
+        return ctypes.CDLL(str(self._path))
 
     @functools.cached_property
     def why_missing(self) -> str:
-        """The reason why this machine cannot use them; empty if it can."""
+        """Why this machine cannot use the kernels; empty if it can."""
         if IS_X86 and not torch.backends.cpu.get_cpu_capability().startswith("AVX"):  # AVX2 or more
-            why = "this processor, or ATEN_CPU_CAPABILITY, has no AVX2"
+            why = "AVX2 is missing in this processor, or disabled by ATEN_CPU_CAPABILITY"
         elif not self._path.is_file():
             others = any(self._path.parent.glob("kernels.*.so"))
-            found = "they were built from other sources" if others else "they were not built"
+            found = "built from other sources" if others else "not built"
             why = (
-                f"{found}; where there is a C++ compiler, installing builds them (in a clone: pip "
+                f"{found}; installing builds them if there is a C++ compiler (in a clone: pip "
                 "install -e .)"
             )
         else:
@@ -206,23 +176,25 @@ class Kernels:
             except OSError as error:
                 why = " ".join(str(error).split())
         logger.warning(
-            "compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", why
+            "no compiled kernels, using slower PyTorch code; results differ in the last digits: %s",
+            why,
         )
         return why
 
     def usable(self, wanted: bool | None) -> bool:
-        """Whether to use them: not if ``wanted`` is False. True warns where there are none."""
+        """Whether to use the kernels. False never does; True warns if they are missing."""
         if wanted is False:
             return False
         why = self.why_missing
         if why and wanted:
+            # Python shows each text once
             warnings.warn(
-                f"torch computes what kernels were asked for: {why}", stacklevel=1
-            )  # one text is shown once
+                f"compiled kernels are missing, using PyTorch instead: {why}", stacklevel=1
+            )
         return not why
 
     def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:
-        """Whether to use them for these tensors: float32, on a CPU; ``wanted`` as for
+        """Whether to use the kernels for these tensors: float32, on a CPU; ``wanted`` as for
         :meth:`usable`."""
         suited = all(
             tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors
@@ -234,11 +206,11 @@ KERNELS = Kernels(library_path())
 
 
 def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object) -> None:
-    """Call a function of a C++ file in :func:`~pointsplat_ns.system.threads.most_threads` threads,
-    or in one if more are not worth it.
+    """Call a C++ function on :func:`~pointsplat_ns.system.threads.most_threads` threads, or on one
+    if more are not ``worth_it``.
 
-    The last parameter of the function points to the number of pieces of work that threads have
-    taken. ctypes lets go of Python during the call.
+    The last parameter of the function points to a counter of the work items taken by threads.
+    ctypes releases the GIL during the call.
     """
     taken = ctypes.c_int64(0)
     call = functools.partial(function, *arguments, ctypes.byref(taken))
@@ -248,12 +220,12 @@ def on_threads(worth_it: bool, function: Callable[..., object], *arguments: obje
         try:
             for _ in range(threads - 1):
                 others.append(pool("kernel", os.cpu_count() or 1).submit(call))
-        except RuntimeError as error:  # no more threads are started: this one does the rest
-            ending = "shutdown" in str(error)  # else the system has a limit
+        except RuntimeError as error:  # cannot start more threads: this one does the rest
+            ending = "shutdown" in str(error)  # else the system's limit is reached
             if ending and threading.current_thread() is not threading.main_thread():
-                raise SystemExit from None  # ends one of a viewer, for which nobody waits
+                raise SystemExit from None  # ends a viewer's thread, for which nobody waits
         call()
     finally:
-        wait(others)  # they use the memory of the arguments, also where Ctrl-C ended the call here
+        wait(others)  # they use the arguments' memory, even if Ctrl-C ended the call here
     for other in others:
         other.result()

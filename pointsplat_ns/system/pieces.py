@@ -1,4 +1,4 @@
-"""Computes many rows in pieces on several threads, so that intermediate results stay small."""
+"""Computes many rows in pieces on several threads, to keep intermediate results small."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 from pointsplat_ns.system.threads import in_threads
 
 CHUNK = 1 << 16
-"""Number of rows of a piece on a CPU."""
+"""Number of rows per piece on a CPU."""
 
 
 def pieces(count: int, device: torch.device, rows: int = CHUNK) -> list[slice]:
-    """All of ``count`` rows in pieces of so many; of eight times as many on a GPU, which small ones
-    leave idle."""
+    """Slices of ``rows`` rows that cover ``count`` rows; eight times as large on a GPU, which small
+    pieces leave idle."""
     size = rows if device.type == "cpu" else 8 * rows
     return [slice(first, min(first + size, count)) for first in range(0, count, size)]
 
@@ -26,11 +26,11 @@ def in_pieces(
     *shape: int,
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
-    """Results (n, *shape) of a function for all members (n,), computed for a piece (m,) of them at
-    a time.
+    """Results (n, *shape) of a function of members (n,), computed for pieces (m,) at a time.
 
-    They are written into one tensor on the members' device: small results kept apart would hold on
-    to the memory of the large pieces."""
+    Results are written into one tensor on the members' device, because many small results would
+    fragment the memory of the large pieces.
+    """
     result = torch.empty(len(members), *shape, dtype=dtype, device=members.device)
 
     def fill(these: slice) -> None:

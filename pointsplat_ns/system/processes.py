@@ -1,6 +1,6 @@
-"""Several processes that train one network: their ranks, and what they exchange.
+"""Processes that train one network together: ranks and communication.
 
-In a single process every function here changes nothing. The processes are those of
+In a single process every function here is a no-op. The processes are those of
 ``torch.distributed``, started by ``torchrun`` or by nerfstudio, with the backend nccl on GPUs and
 gloo on CPUs.
 """
@@ -21,8 +21,8 @@ from pointsplat_ns.errors import PointSplatError
 
 
 def torchrun_rank() -> tuple[int, int]:
-    """Rank of this process and number of processes that ``torchrun`` started together; 0 and 1
-    without it."""
+    """Rank of this process and number of processes that ``torchrun`` started; 0 and 1 without
+    it."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return 0, 1
     return int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
@@ -34,24 +34,24 @@ def local_rank() -> int:
 
 
 def connect_torchrun(backend: Literal["gloo", "nccl"] = "gloo") -> None:
-    """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a
-    second time. The backend is nccl where each process has a GPU of its own."""
+    """Connect the processes that ``torchrun`` started; no effect for a single process, or the
+    second time. Use the backend nccl if each process has its own GPU."""
     if torchrun_rank()[1] == 1 or dist.is_initialized():
         return
     if backend == "nccl":
-        torch.cuda.set_device(local_rank())  # nccl gathers objects through the current device
-    # The last scene of one process may take long.
+        torch.cuda.set_device(local_rank())  # nccl gathers objects on the current device
+    # One process may take long for its last scene.
     dist.init_process_group(backend, timeout=datetime.timedelta(days=1000))
     atexit.register(dist.destroy_process_group)
 
 
 def world_size() -> int:
-    """Number of processes that work together."""
+    """Number of connected processes."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
 def rank() -> int:
-    """Index of this process among all machines' processes."""
+    """Index of this process among all processes on all machines."""
     return dist.get_rank() if world_size() > 1 else 0
 
 
@@ -66,7 +66,7 @@ def any_rank(flag: bool, device: torch.device | str) -> bool:
 
 
 def gathered(items: list[Any]) -> list[Any]:
-    """The items of all processes, in the order of their ranks; the same list in every process."""
+    """Items of all processes, ordered by rank; the same list in every process."""
     if world_size() == 1:
         return items
     parts: list[Any] = [None] * world_size()
@@ -75,10 +75,10 @@ def gathered(items: list[Any]) -> list[Any]:
 
 
 def by_first(work: Callable[[], object]) -> None:
-    """Let the first process do a work, while the others wait.
+    """Let the first process do the work while the others wait.
 
     Raises:
-        PointSplatError: in the others, if it failed or ended; the error itself in the first.
+        PointSplatError: in the others, if it failed or ended; the first raises the error itself.
     """
     failure: Exception | None = None
     if rank() == 0:
@@ -88,9 +88,9 @@ def by_first(work: Callable[[], object]) -> None:
             failure = error
     try:
         text = gathered([failure and (str(failure) or type(failure).__name__)])[0]
-    except RuntimeError as error:  # of the connection
+    except RuntimeError as error:  # connection lost
         raise failure or PointSplatError(
-            "another process ended; the same command resumes"
+            "another process ended; run the same command to resume"
         ) from error
     if failure is not None:
         raise failure
@@ -108,7 +108,7 @@ def share_state(module: nn.Module) -> None:
 
 @torch.no_grad()
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Average gradients over processes. With several, a parameter without a gradient in any of them
+    """Average gradients over processes. With several, a parameter without a gradient in any process
     gets zeros."""
     parameters = list(parameters)
     if world_size() == 1 or not parameters:

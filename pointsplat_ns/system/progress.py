@@ -1,4 +1,4 @@
-"""Progress bars, and lines in place of them where there is no terminal."""
+"""Progress bars, or log lines if there is no terminal."""
 
 from __future__ import annotations
 
@@ -8,30 +8,32 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import IO, Any, TypeVar
 
+from pointsplat_ns.errors import printable
+
 Progress = Callable[[str, float], None]
-"""Called with the name of the current task and the share of it that is done, in [0, 1]."""
+"""Called with the name of the current task and its share done, in [0, 1]."""
 
 Item = TypeVar("Item")
 
 
 def silent(what: str, share: float) -> None:
-    """Progress that is not shown."""
+    """Progress that is not displayed."""
 
 
 def within(whole: str, progress: Progress) -> Progress:
-    """Progress of the tasks that are parts of another: their names come after its name."""
+    """Progress of subtasks: their names follow the name of the whole task."""
     return lambda what, share: progress(f"{whole}: {what}", share)
 
 
 @contextmanager
 def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
-    """A bar in the terminal or notebook, with an estimate of the time left; it is erased at the
-    end. Elsewhere, as in a log file, a line from time to time, such as ``[1:30] merging: 45 %,
-    about 1:50 left``: minutes and seconds since the beginning, and what is left of the task at
-    hand.
+    """A progress bar in the terminal or notebook, with an estimate of the time left; it is erased
+    at the end. Elsewhere, as in a log file, a line at intervals, such as ``[1:30] merging: 45 %,
+    about 1:50 left``: minutes and seconds since the start, and the estimated time left for the
+    current task.
 
     True shows a bar or writes lines, on standard error; False shows nothing; a function is returned
-    as it is.
+    unchanged.
     """
     if callable(progress):
         yield progress
@@ -40,6 +42,7 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
         yield silent
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
@@ -60,18 +63,18 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
             if what not in tasks:
                 for task in tasks.values():
                     bar.update(task, visible=False)
-                tasks[what] = bar.add_task(what, total=1.0)
+                tasks[what] = bar.add_task(escape(printable(what)), total=1.0)
             bar.update(tasks[what], completed=share, visible=True)
 
         yield show
 
 
 def _lines(stream: IO[str]) -> Progress:
-    """Writes what is being done to ``stream``, every 30 seconds."""
+    """Writes the current task to ``stream``, every 30 seconds."""
     start = written = time.monotonic()
     begun: dict[
         str, tuple[float, float]
-    ] = {}  # when each task was first heard of, and what was done of it by then
+    ] = {}  # start time of each task, and its share done by then
 
     def show(what: str, share: float) -> None:
         nonlocal written
@@ -84,9 +87,9 @@ def _lines(stream: IO[str]) -> Progress:
         left = ""
         if gained > 0 and share < 1:
             left = f", about {_clock((now - start_of_task) * (1 - share) / gained)} left"
-        with suppress(OSError, ValueError):  # nobody reads any more: the work continues
+        with suppress(OSError, ValueError):  # the stream is closed: the work continues
             print(
-                f"[{_clock(now - start)}] {what}: {100 * share:.0f} %{left}",
+                f"[{_clock(now - start)}] {printable(what)}: {100 * share:.0f} %{left}",
                 file=stream,
                 flush=True,
             )
@@ -103,7 +106,7 @@ def _clock(seconds: float) -> str:
 def tracked(
     items: Iterable[Item], what: str, total: int, progress: bool | Progress = True
 ) -> Iterator[Item]:
-    """Iterate over the items, with a bar that shows how many of ``total`` are done."""
+    """Iterate over the items, with a progress bar of ``total`` items."""
     with progress_bar(progress) as show:
         report = functools.partial(show, what)
         report(0.0)

@@ -1,5 +1,4 @@
-"""Counts, sizes and durations as people write them: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB, 5 min 14
-s."""
+"""Counts, sizes and durations as text: 1e3, 10k, 1.5M, 1,000, 12kB, 1GB, 5 min 14 s."""
 
 from __future__ import annotations
 
@@ -9,8 +8,8 @@ from decimal import Decimal
 
 
 def parse_number(text: str) -> float:
-    """A number, with k, M or G for thousands, millions or billions. Raises ValueError if it is
-    none.
+    """A number, with k, M or G for thousands, millions or billions. Raises ValueError for any other
+    text.
 
     Example:
         >>> parse_number("1e3"), parse_number("1.5M"), parse_number("1,000"), parse_number("0.3")
@@ -20,7 +19,7 @@ def parse_number(text: str) -> float:
     found = re.fullmatch(form, text.strip(), re.IGNORECASE)
     if found is None or not re.match(r"[+-]?[\d.]*\d", found[1]):
         raise ValueError(
-            f"{text!r} is no number; expected one such as 0.5, 1000, 1,000, 1e3, 10k or 1.5M"
+            f"{text!r} is not a number; expected one such as 0.5, 1000, 1,000, 1e3, 10k or 1.5M"
         )
     number = float(
         Decimal(found[1].replace(",", ""))
@@ -32,7 +31,7 @@ def parse_number(text: str) -> float:
 
 
 def parse_count(text: str) -> int:
-    """A whole number, as :func:`parse_number` reads it. Raises ValueError if it is none.
+    """A whole number, as :func:`parse_number` reads it. Raises ValueError for any other text.
 
     Example:
         >>> parse_count("10k"), parse_count("1.5M")
@@ -41,25 +40,24 @@ def parse_count(text: str) -> int:
     number = parse_number(text)
     if number != int(number):
         raise ValueError(
-            f"{text!r} is no whole number; expected one such as 1000, 1,000, 1e3 or 10k"
+            f"{text!r} is not a whole number; expected one such as 1000, 1,000, 1e3 or 10k"
         )
     return int(number)
 
 
 def parse_megabytes(text: str) -> float:
-    """A size, in units of 10^6 bytes; a number without a unit is in MB. Raises ValueError if it is
-    none.
+    """A size in MB (10^6 bytes), also the default unit. Raises ValueError for any other text.
 
     Example:
-        >>> parse_megabytes("12kb"), parse_megabytes("1GB"), parse_megabytes("12"), parse_megabytes("5000B")
-        (0.012, 1000.0, 12.0, 0.005)
+        >>> [parse_megabytes(text) for text in ("12kb", "1GB", "12", "5000B")]
+        [0.012, 1000.0, 12.0, 0.005]
     """
     text = text.strip()
     return parse_number(text[:-1]) / 1e6 if text.lower().endswith("b") else parse_number(text)
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things.
+    """A count with its noun.
 
     Example:
         >>> counted(1, "size"), counted(2000, "point")
@@ -69,11 +67,11 @@ def counted(number: int, noun: str) -> str:
 
 
 def seconds_text(seconds: float) -> str:
-    """A duration with the digits that matter.
+    """A duration with its significant digits.
 
     Example:
-        >>> seconds_text(3.14), seconds_text(31.4), seconds_text(314), seconds_text(3140), seconds_text(7000)
-        ('3.1 s', '31 s', '5 min 14 s', '52 min', '1 h 57 min')
+        >>> [seconds_text(seconds) for seconds in (3.14, 31.4, 314, 3140, 7000)]
+        ['3.1 s', '31 s', '5 min 14 s', '52 min', '1 h 57 min']
     """
     if seconds < 100:
         return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"

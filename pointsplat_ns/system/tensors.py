@@ -1,6 +1,5 @@
-"""torch's global settings change nothing here: each tensor is made with its type and its place
-named, functions that need gradients leave the caller's inference mode, and the rasterizer leaves
-autocast."""
+"""Independence of torch's global settings: tensors get an explicit dtype and device, functions that
+need gradients leave the caller's inference mode, and the rasterizer leaves autocast."""
 
 from __future__ import annotations
 
@@ -25,8 +24,8 @@ def numbers(count: int, device: torch.device) -> torch.Tensor:
 
 
 def add_rows(total: torch.Tensor, index: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """Add values (n, *) to the rows ``index`` (n,) of a total (N, *), and return it: in one order
-    on each device, which ``index_add_`` does not keep on a GPU."""
+    """Add values (n, *) to the rows ``index`` (n,) of a total (N, *), and return it. The order of
+    summation is fixed on each device, unlike that of ``index_add_`` on a GPU."""
     if total.device.type == "cpu":
         return total.index_add_(0, index, values)
     return total.index_put_((index,), values, accumulate=True)
@@ -36,15 +35,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def of_network() -> dict[str, Any]:
-    """Type and place of a network's parameters: float32, on the device that the network's
-    constructor has entered, which ``torch.get_default_device`` does not tell in torch 2.6."""
+    """dtype and device of a network's parameters: float32, on the device context of the network's
+    constructor, which ``torch.get_default_device`` does not report in torch 2.6."""
     return {"dtype": torch.float32, "device": None}
 
 
 def normal_mode(function: Function) -> Function:
-    """The function, run with :func:`~pointsplat_ns.system.threads.one_thread_each`, and outside of
-    inference mode even if it is called in it. Scenes and views among its arguments that were made
-    in inference mode are copied, because torch takes no gradients of such tensors."""
+    """Run the function with :func:`~pointsplat_ns.system.threads.one_thread_each` and outside of
+    inference mode. Scenes and views that were created in inference mode are copied, because torch
+    computes no gradients for such tensors."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
@@ -57,8 +56,8 @@ def normal_mode(function: Function) -> Function:
 
 
 def full_precision(function: Function) -> Function:
-    """The function, run without autocast on the device of its first tensor: in bfloat16, to which
-    autocast rounds matrix products, a position of 100 pixels is held to half a pixel."""
+    """Run the function without autocast on the device of its first tensor: in bfloat16, to which
+    autocast rounds matrix products, a position of 100 pixels has a precision of half a pixel."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
@@ -79,8 +78,8 @@ def full_precision(function: Function) -> Function:
 
 
 def _copied(value: Any) -> Any:
-    """A tensor of inference mode, copied; a dataclass with such tensors, copied; anything else as
-    it is."""
+    """A copy of an inference-mode tensor, or of a dataclass with such tensors; anything else
+    unchanged."""
     if isinstance(value, torch.Tensor):
         return value.clone() if value.is_inference() else value
     fields = (

@@ -1,10 +1,10 @@
-"""Work on several threads, each of which computes on one.
+"""Runs work on several threads, with single-threaded torch operations on each.
 
-Where torch shares an operation between threads, they wait for one another at its end, on their
-cores, and small operations end often: two threads take as long as one, and ten times as long where
-another program has one of the cores. Here torch uses one thread (:func:`one_thread_each`). Pieces
-of work (:func:`in_turn`), and kernels of this package
-(:func:`pointsplat_ns.system.kernels.on_threads`) use all, and sleep while they wait.
+When torch shares an operation between threads, they busy-wait for one another at its end. Small
+operations end often: two threads take as long as one, and ten times as long if another program
+occupies one of the cores. Here torch uses one thread (:func:`one_thread_each`). Pieces of work
+(:func:`in_turn`) and compiled kernels (:func:`pointsplat_ns.system.kernels.on_threads`) use all
+threads, which sleep while they wait.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from contextvars import copy_context
 from typing import TypeVar
 
 import torch
@@ -28,23 +29,26 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 THREADS_VARIABLE = "OMP_NUM_THREADS"
-"""Environment variable with the number of torch's threads. Where it is set, more are used than
-there are cores."""
+"""Environment variable with torch's number of threads. If it is set, the number may exceed the
+number of cores."""
+
+MOST_THREADS = 1024
+"""Maximum number of threads, because the system does not start any number."""
 
 
 class Own(threading.local):
-    """What :func:`one_thread_each` found in one thread of Python."""
+    """State of :func:`one_thread_each` in one Python thread."""
 
     most: int | None = None
-    """Number of threads that torch had before; None outside."""
+    """torch's number of threads before; None outside of the context."""
 
 
 own = Own()
 
 
 def most_threads() -> int:
-    """Number of threads that share work here: as many as torch has, or had outside of
-    :func:`one_thread_each`; no more than there are cores, unless ``OMP_NUM_THREADS`` says so."""
+    """Number of threads that share work: torch's, as set outside of :func:`one_thread_each`; no
+    more than there are cores, unless ``OMP_NUM_THREADS`` is set."""
     if own.most is not None:
         return own.most
     threads = torch.get_num_threads()
@@ -53,8 +57,8 @@ def most_threads() -> int:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread while the context is open: for operations too small to share, and
-    for sums that must not be rounded in another way on another number of threads."""
+    """Let torch use one thread inside of the context: for operations too small to share, and for
+    sums whose rounding must not depend on the number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -65,7 +69,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Let torch use one thread while the context is open, and pieces of work and kernels
+    """Let torch use one thread inside of the context, while pieces of work and kernels use
     :func:`most_threads`. The result does not depend on their number."""
     outer = own.most
     own.most = most_threads()
@@ -77,29 +81,30 @@ def one_thread_each() -> Iterator[None]:
 
 
 def pool(name: str, count: int, inside: int = 1) -> ThreadPoolExecutor:
-    """Threads for one kind of work, torch using ``inside`` in each. New threads for each use would
-    take a fifth of a small step."""
+    """Thread pool for one kind of work, with ``inside`` torch threads in each thread. Pools are
+    reused, because starting threads would take a fifth of a small step."""
     return _pool(os.getpid(), name, count, inside)
 
 
 @functools.cache
 def _pool(process: int, name: str, count: int, inside: int) -> ThreadPoolExecutor:
-    """Threads of a process: those of one that forked are not the other's."""
+    """Pool of a process: a forked process does not inherit threads."""
     return ThreadPoolExecutor(count, f"pointsplat-{name}", torch.set_num_threads, (inside,))
 
 
 def in_turn(
     function: Callable[[Item], Result], items: Sequence[Item], device: torch.device, inside: int = 1
 ) -> Iterator[Result]:
-    """The results of a function of each item, in their order: computed on a CPU on
-    :func:`most_threads` threads, torch and kernels using ``inside`` in each; for a GPU in this
-    thread, as a GPU runs one operation of a process after the other, and not all of torch may be
-    called there from several threads.
+    """Map a function over items, and yield the results in order.
 
-    One operation on a small piece that stays in the cache is faster on one thread than shared
-    between several, which wait for one another. Calls must not depend on each other. torch takes
-    gradients in them if it does here. No call runs any more when this ends, by an error or Ctrl-C,
-    too.
+    On a CPU, calls run on :func:`most_threads` threads, with ``inside`` threads for torch and
+    kernels in each. For a GPU, they run in this thread, because a GPU runs one operation of a
+    process at a time, and some torch functions must not be called from several threads there.
+
+    An operation on a small piece that stays in the cache is faster on one thread than shared
+    between several, which wait for one another. Calls must not depend on each other. They inherit
+    torch's gradient mode and the context variables. All calls have ended when this returns, also
+    after an error or Ctrl-C.
     """
     count = min(most_threads(), len(items)) if device.type == "cpu" else 1
     if count <= 1:
@@ -113,7 +118,7 @@ def in_turn(
             return function(item)
 
     threads = pool("pieces", count, inside)
-    futures = deque(threads.submit(call, item) for item in items)
+    futures = deque(threads.submit(copy_context().run, call, item) for item in items)
     try:
         while futures:
             result = futures[0].result()
@@ -128,21 +133,21 @@ def in_turn(
 def in_threads(
     function: Callable[[Item], object], items: Sequence[Item], device: torch.device
 ) -> None:
-    """Call a function with each item as :func:`in_turn` does."""
+    """Call a function for each item, as :func:`in_turn` does."""
     for _ in in_turn(function, items, device):
         pass
 
 
 @contextmanager
 def fixed_threads(count: int | None) -> Iterator[None]:
-    """Let torch use so many threads while the context is open, here and in programs that are
-    started; None changes nothing. Raises PointSplatError if the number is below 1, or above 1024:
-    the system does not start any number of threads, and torch ends the program then."""
+    """Let torch use ``count`` threads inside of the context, here and in child processes; None
+    changes nothing. Raises PointSplatError if the number is below 1 or above 1024, because torch
+    aborts the program if the system cannot start the threads."""
     if count is None:
         yield
         return
-    if not 1 <= count <= 1024:
-        raise PointSplatError(f"{count} threads; expected 1 to 1024")
+    if not 1 <= count <= MOST_THREADS:
+        raise PointSplatError(f"{count} threads; expected 1 to {MOST_THREADS}")
     before = torch.get_num_threads()
     variable = os.environ.get(THREADS_VARIABLE)
     torch.set_num_threads(count)
@@ -158,7 +163,7 @@ def fixed_threads(count: int | None) -> Iterator[None]:
 
 
 def now(device: torch.device) -> float:
-    """Seconds since any moment, once the device has done its work."""
+    """Seconds on a monotonic clock, after the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

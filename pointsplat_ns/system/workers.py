@@ -1,4 +1,4 @@
-"""Work that several processes of this machine share, by :mod:`concurrent.futures`."""
+"""Distributes work over several processes of this machine, with :mod:`concurrent.futures`."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import functools
 import os
 import pickle
 import signal
+import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import connection, get_context, util
+from multiprocessing import connection, get_context
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pointsplat_ns.errors import DataError, PointSplatError
@@ -23,12 +25,11 @@ Result = TypeVar("Result")
 
 
 class Workers(Generic[Item, Result]):
-    """Processes that call a function with one item after the other, and share the cores. With one
-    job, this process does. When the context is left, or this process ends, the others end at once,
-    whatever they do.
+    """Processes that call a function for items and share the cores. With one job, the current
+    process does the work. When the context or this process ends, the others end at once.
 
     Args:
-        function: pickled once for each process.
+        function: pickled once per process.
         jobs: number of processes.
     """
 
@@ -40,23 +41,21 @@ class Workers(Generic[Item, Result]):
         if self._jobs > 1:
             context = get_context("spawn")
             ends, self._held = context.Pipe(duplex=False)
-            function = pickle.dumps(
-                self._function
-            )  # by multiprocessing, tensors would be moved to shared memory
-            with _started_safely(
-                self._jobs
-            ):  # a pool starts multiprocessing's tracker of resources
+            # multiprocessing would move tensors to shared memory
+            function = pickle.dumps(self._function)
+            # a pool starts multiprocessing's resource tracker
+            with _started_safely(self._jobs):
                 self._pool = ProcessPoolExecutor(self._jobs, context, _begin, (ends, function))
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._jobs > 1:
-            self._held.close()  # which all processes notice
+            self._held.close()  # all processes notice this
             self._pool.shutdown(cancel_futures=True)
 
     def results(self, items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
-        """Each item with its result, in the order in which they are made. Raises what the function
-        raises, and PointSplatError if a process is killed."""
+        """Each item with its result, in order of completion. Raises the exceptions of the function,
+        and PointSplatError if a process is killed."""
         if self._jobs == 1:
             for item in items:
                 yield item, self._function(item)
@@ -68,23 +67,23 @@ class Workers(Generic[Item, Result]):
                 yield futures[future], future.result()
         except BrokenProcessPool as error:
             raise PointSplatError(
-                "a process was killed, as happens where memory is short; the same command resumes, "
-                "with fewer --jobs if need be"
+                "a process was killed, probably because memory ran out; run the same command to "
+                "resume, with fewer --jobs if needed"
             ) from error
 
 
 def check_jobs(jobs: int) -> None:
-    """Raise a DataError if a number of processes is not positive."""
+    """Raise a DataError if the number of processes is not positive."""
     if jobs < 1:
         raise DataError(f"jobs is {jobs}; expected 1 or more")
 
 
 _function: Callable[[], Callable[[Any], Any]]
-"""In a process of :class:`Workers`: gives its function."""
+"""The function, in a process of :class:`Workers`."""
 
 
 def _begin(ends: connection.Connection, function: bytes) -> None:
-    """The start of a process, which ends with the one that started it. Ctrl-C is for that one."""
+    """Initialise a process: it ends with its parent, and leaves Ctrl-C to the parent."""
     global _function
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(ends,), daemon=True).start()
@@ -96,45 +95,66 @@ def _call(item: Any) -> Any:
 
 
 def _end_with(ends: connection.Connection) -> None:
-    """End this process, whatever it does, when the other end of a pipe is closed."""
+    """End this process at once when the other end of a pipe is closed."""
     connection.wait([ends])
     os._exit(1)
 
 
 _starting = threading.Lock()
 
+SAFE_PATH_VARIABLE = "PYTHONSAFEPATH"
+"""Environment variable by which Python, from 3.11 on, does not put the current folder on its
+path."""
+
+HAS_SAFE_PATH = sys.version_info >= (3, 11)
+
 
 @contextmanager
 def _started_safely(jobs: int) -> Iterator[None]:
-    """Let processes that are started while the context is open have no Ctrl-C, not the current
-    folder on their path, and as many threads each as the environment variable ``OMP_NUM_THREADS``
-    says, else their share of the cores.
+    """Inside of this context, child processes ignore Ctrl-C, do not have the current folder on
+    their path, and use as many threads as the environment variable ``OMP_NUM_THREADS`` says, or
+    else their share of the cores.
 
     multiprocessing starts them and its resource tracker with ``python -c``, which puts the current
     folder first on the path: what lies beside the scenes would be imported in place of Python's own
-    modules. Python 3.10 has no option against it. Ctrl-C would show a traceback of each process
-    that is still importing.
+    modules. Ctrl-C would show a traceback of each process that is still importing: they inherit
+    that it is blocked.
+
+    Raises:
+        PointSplatError: with Python 3.10, which has no option against it, if the current folder has
+            a file or folder with the name of one of Python's own modules.
     """
-
-    def start_safely(path: bytes, args: Sequence[str], passfds: Sequence[int]) -> int:
-        words = [*args]
-        at = words.index("-c") + 1
-        words[at] = (
-            # sys is part of the interpreter
-            f"import sys; sys.path = [*filter(None, sys.path)]; {words[at]}"
-        )
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-        try:
-            return start(path, words, passfds)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
+    if not HAS_SAFE_PATH:
+        _need_no_shadows(Path.cwd())
     threads = most_threads() if THREADS_VARIABLE in os.environ else max(1, cores() // jobs)
-    with _starting, fixed_threads(threads):
-        helpers: Any = util
-        start = helpers.spawnv_passfds
-        helpers.spawnv_passfds = start_safely
+    with _starting, fixed_threads(threads), _environment(SAFE_PATH_VARIABLE, "1"):
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
             yield
         finally:
-            helpers.spawnv_passfds = start
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _environment(name: str, value: str) -> Iterator[None]:
+    """Set an environment variable while the context is open."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+def _need_no_shadows(folder: Path) -> None:
+    """Raise PointSplatError if a file or folder has the name of one of Python's own modules."""
+    for path in sorted(folder.iterdir()):
+        if path.name.split(".")[0] in sys.stdlib_module_names:
+            raise PointSplatError(
+                f"{path}: Python 3.10 would import it in place of its own module in processes that "
+                "are started here; expected no such name; start the command in another folder, or "
+                "with Python 3.11"
+            )

@@ -9,6 +9,8 @@ from refusing import refusal, run
 import pointsplat_ns as ps
 from making import same_bits
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture()
 def room(tmp_path) -> Path:

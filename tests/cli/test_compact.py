@@ -14,15 +14,18 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 from html_parts import parts_of
 from making import ball, same
 from pointsplat_ns.cli.compact import GOALS
-from pointsplat_ns.compression import pictures, quality
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_ply, read_scene, write_ply
-from pointsplat_ns.io.discovery import find_scenes
-from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.io.scene import save
-from pointsplat_ns.pages.flight import FlightFrame
+from pointsplat_ns.pipeline import quality
 from pointsplat_ns.pruning import METHODS, prune
-from pointsplat_ns.refiner import Refiner, preset, save_refiner
+from pointsplat_ns.refinement import Refiner, preset, save_refiner
+from pointsplat_ns.scene.discovery import find_scenes
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply import read_ply, write_ply
+from pointsplat_ns.scene.reading import read_scene, save
+from pointsplat_ns.system.files import bytes_text
+from pointsplat_ns.tools import comparison_plots as pictures
+from pointsplat_ns.tools.pages.flight import FlightFrame
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def room(n: int = 150) -> Gaussians:
@@ -182,7 +185,7 @@ def test_what_cannot_be_used_is_refused_in_one_line_and_early(
     ply, helps, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(
-        "pointsplat_ns.compression.compact.prune_scene", None
+        "pointsplat_ns.pipeline.compact_scene.prune_scene", None
     )  # a call of it would be no error of ours
     save_refiner(Refiner(preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
     shown = tmp_path / "shown"

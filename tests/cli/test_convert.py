@@ -8,7 +8,9 @@ from refusing import refusal, run
 
 import pointsplat_ns as ps
 from making import cloud, same
-from pointsplat_ns.io.files import bytes_text, three_digits
+from pointsplat_ns.system.files import bytes_text, three_digits
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture

@@ -19,8 +19,10 @@ from refusing import refusal, run
 import pointsplat_ns as ps
 from html_parts import parts_of
 from making import ball, same
-from pointsplat_ns import folders
-from pointsplat_ns.io.formats import format_like, format_to_read
+from pointsplat_ns.scene.formats import format_like, format_to_read
+from pointsplat_ns.tools import folders
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture(scope="module")
@@ -124,10 +126,10 @@ def test_a_gallery_shows_each_scene_before_and_after_or_why_not(
     )
     compact_scene = folders.compact_scene
 
-    def interrupted(dense, *given):
+    def interrupted(dense, *given, **named):
         if (tmp_path / "small" / "deep" / "c.spz").exists():
             raise KeyboardInterrupt
-        return compact_scene(dense, *given)
+        return compact_scene(dense, *given, **named)
 
     monkeypatch.setattr(folders, "compact_scene", interrupted)
     with pytest.raises(SystemExit) as end:

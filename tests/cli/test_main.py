@@ -146,7 +146,7 @@ def test_every_command_has_examples_of_itself(capsys):
 
 @pytest.mark.parametrize(
     ("words", "why"),
-    [("prune room.ply --keeep 10%", "--keeep"), ("view a.ply --port 1.5", "is no whole number")],
+    [("prune room.ply --keeep 10%", "--keeep"), ("view a.ply --port 1.5", "is not a whole number")],
 )
 def test_a_command_line_that_is_not_understood_has_status_2(words, why, capsys):
     with pytest.raises(SystemExit) as end:

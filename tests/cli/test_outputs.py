@@ -1,15 +1,25 @@
-"""Outputs: refused, replaced, interrupted."""
+"""Outputs: refused, claimed, replaced, interrupted."""
 
 import os
+import threading
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import torch
 from refusing import refusal
 
 import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import repair
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.pipeline import repair
+from pointsplat_ns.pipeline.repair_state import Unfinished
+from pointsplat_ns.pruning.merging.cells import Scratch
+from pointsplat_ns.system import files, outputs
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 FAILING = (
     "prune damaged.ply -o OUT.ply",
@@ -69,6 +79,203 @@ def test_an_interrupted_write_leaves_nothing_new_and_what_was_there_stays(
     assert end.value.code == 130 and capsys.readouterr().err.endswith("interrupted\n")
     assert Path(name).read_text() == "from before"
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+HALF = ("--keep", "50%", "--by", "opacity", "--resolution", "32x24")
+COMPACT = ("compact", "room.ply", *HALF, "--effort", "instant")
+SMALL = ("--width", "16", "--height", "12")
+WORK = {
+    "room_pruned.ply": ("prune", "room.ply", *HALF),
+    "small.spz": (*COMPACT, "-o", "small.spz"),
+    "page.html": (*COMPACT, "--html", "page.html"),
+    "pair.png": (*COMPACT, "--picture", "pair.png"),
+    "room_clean.ply": ("clean", "room.ply", "--strength", "0", "--resolution", "32x24"),
+    "gone.png": ("clean", "room.ply", "--resolution", "32x24", "--picture", "gone.png"),
+    "room.splat": ("convert", "room.ply", "room.splat"),
+    "own.sog": ("export", "room.ply", "-o", "own.sog"),
+    "first.png": ("render", "room.ply", "-o", "first.png", *SMALL),
+    "room.mp4": ("render", "room.ply", "--seconds", "0.1", *SMALL),
+    "sheet.png": ("info", "room.ply", "--views", "sheet.png", "--resolution", "32x24"),
+    "room.rad": ("lod", "room.ply", "--levels", "50%", "-o", "room.rad"),
+    "all.html": ("compact", "scenes", *HALF, "--effort", "instant", "--html", "all.html"),
+    "all.png": ("compact", "scenes", *HALF, "--effort", "instant", "--picture", "all.png"),
+    "demo.ply": ("demo", "-o", "demo.ply"),
+    "trade/tradeoff.json": (
+        *("tradeoff", "room.ply", "-o", "trade", "--keep", "50%", "--repairs", "none"),
+        *("--views", "2", "--resolution", "32x24"),
+    ),
+    "scenes_compact/1.ply": ("compact", "scenes", *HALF, "--effort", "instant"),
+}
+"""Commands by a file that they write."""
+
+FOLDERS = {
+    "room_lod": ("lod", "room.ply", "--levels", "50%"),
+    "stream": ("lod", "room.ply", "--levels", "50%", "--stream", "-o", "stream"),
+    "tiles": ("lod", "room.ply", "--levels", "50%", "--tiles", "-o", "tiles"),
+    "frames": ("render", "room.ply", "-o", "frames", "--seconds", "0.1", *SMALL),
+}
+"""Commands by a folder that they write."""
+
+
+@pytest.fixture()
+def scenes(here) -> None:
+    """A scene, and a folder of another one."""
+    scene = ball(40, opacity=1.0, bright=1.0)
+    ps.save(scene, "room.ply")
+    ps.save(scene, "scenes/1.ply")
+
+
+def hidden(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.name.startswith(".")]
+
+
+def called_before(monkeypatch, module: object, name: str, first: Callable[..., None]) -> None:
+    """Let a function of a module be preceded by a call of ``first`` with its arguments."""
+    usual = getattr(module, name)
+
+    def both(*arguments):
+        first(*arguments)
+        return usual(*arguments)
+
+    monkeypatch.setattr(module, name, both)
+
+
+def without_hard_links(*arguments: object, **options: object) -> None:
+    raise PermissionError(1, "Operation not permitted")
+
+
+@pytest.mark.parametrize(
+    ("name", "links"), [*((name, True) for name in WORK), ("room_pruned.ply", False)]
+)
+def test_a_file_that_appears_during_the_work_stays(name, links, scenes, here, capsys, monkeypatch):
+    def appear(path, *_):
+        if Path(path).name == Path(name).name:
+            Path(name).parent.mkdir(exist_ok=True)
+            Path(name).write_text("a stranger's")
+
+    if not links:
+        monkeypatch.setattr(os, "link", without_hard_links)
+    called_before(monkeypatch, files, "require_space", appear)
+    with pytest.raises(SystemExit) as end:
+        main([*WORK[name]])
+    said = capsys.readouterr()
+    assert end.value.code == 1
+    assert f"{name}: another file of this name appeared meanwhile" in said.err + said.out
+    assert Path(name).read_text() == "a stranger's"
+    assert not hidden(here)
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_folder_that_appears_during_the_work_stays(name, scenes, here, capsys, monkeypatch):
+    taken = {"room_lod": "lod.json", "stream": "lod-meta.json", "tiles": "tileset.json"}
+    file = Path(name) / taken.get(name, "frame_00000.png")
+
+    def appear(*_):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("a stranger's")
+
+    called_before(monkeypatch, files, "put_folder", appear)
+    with pytest.raises(SystemExit) as end:
+        main([*FOLDERS[name]])
+    assert end.value.code == 1
+    assert f"{file}: another file of this name appeared" in capsys.readouterr().err
+    assert file.read_text() == "a stranger's" and [*Path(name).iterdir()] == [file]
+    assert not hidden(here)
+
+
+@pytest.mark.parametrize("name", WORK | FOLDERS)
+def test_a_second_command_is_refused_at_its_start(name, scenes, here, capsys):
+    output = Path(name).parent if name.startswith("scenes_compact") else Path(name)
+    claimed = threading.Event()
+    ended = threading.Event()
+
+    def work() -> None:
+        with outputs.outputs_claimed():
+            outputs.claim(output)
+            claimed.set()
+            ended.wait(60)
+
+    first = threading.Thread(target=work)  # locks of open files do not know of processes
+    first.start()
+    claimed.wait(60)
+    try:
+        error = refusal(capsys, here, *(WORK | FOLDERS)[name])
+        assert f"{output}: another command is writing it" in error
+    finally:
+        ended.set()
+        first.join()
+    assert not hidden(here)
+
+
+@pytest.mark.parametrize("planted", ["file", "link", "folder", "pipe"])
+def test_a_claim_that_a_killed_command_or_a_stranger_left_refuses_nothing(
+    planted, scenes, here, capsys
+):
+    claim = Path(".room_pruned.ply.claim.part")
+    Path("secret").write_text("secret")
+    plant = {
+        "file": claim.touch,
+        "link": lambda: claim.symlink_to("secret"),
+        "folder": claim.mkdir,
+        "pipe": lambda: os.mkfifo(claim),
+    }
+    plant[planted]()
+    main([*WORK["room_pruned.ply"]])
+    assert len(ps.load("room_pruned.ply")) == 20
+    assert Path("secret").read_text() == "secret"
+    assert hidden(here) == ([] if planted in ("file", "pipe") else [here / claim])
+
+
+def test_a_repair_of_another_version_does_not_continue(tmp_path, monkeypatch):
+    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)
+    scene = ball(4, opacity=1.0, bright=1.0)
+    state = dict(scene.items())
+    Unfinished(tmp_path / "state", scene, "work").save(3, lambda: state)
+    assert Unfinished(tmp_path / "state", scene, "work").state(state) is not None
+    monkeypatch.setattr(ps, "__version__", "0.0.0")
+    assert Unfinished(tmp_path / "state", scene, "work").state(state) is None
+
+
+def test_steps_in_cells_stay_after_an_error_only_if_one_was_taken(tmp_path, monkeypatch):
+    folder = tmp_path / "cells"
+    with pytest.raises(SceneError, match="needs"):
+        Scratch(folder, {}, 1 << 62)
+    assert not folder.exists()
+    with suppress(SystemExit), Scratch(folder, {}).left_if_useful():
+        raise SystemExit
+    assert not folder.exists()
+    scratch = Scratch(folder, {})
+    with suppress(SystemExit), scratch.left_if_useful():
+        scratch.make("a", lambda: {"a": torch.zeros(1)})
+        raise SystemExit
+    assert scratch.has("a")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork") or os.geteuid() != 0, reason="becomes another user")
+@pytest.mark.parametrize(
+    "check", [lambda path: files.need_writable(path, False), files.need_folder]
+)
+def test_a_folder_that_takes_no_files_of_an_ordinary_user_is_named(check, here):
+    here.chmod(0o555)
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            os.setuid(65534)
+            check(Path("out"))
+        except SceneError as error:
+            status = 0 if str(error).startswith("out: cannot be written (") else 2
+        finally:
+            os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert os.listdir() == ["damaged.ply"]
+
+
+def test_a_command_that_fails_leaves_no_folder_that_it_made(here):
+    for words in FAILING:
+        with suppress(SystemExit):
+            main(words.replace("OUT", "new/folder/OUT").split())
+        assert os.listdir() == ["damaged.ply"], words
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)], ids=["text", "json"])

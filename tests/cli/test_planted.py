@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import stat
 import subprocess
 import sys
@@ -11,7 +12,12 @@ import pytest
 from PIL import Image
 
 import pointsplat_ns as ps
-from making import normal_scene
+from making import ball, normal_scene
+from pointsplat_ns.cli import main
+from pointsplat_ns.pipeline import repair_budget
+from pointsplat_ns.pipeline.repair_state import Unfinished
+from pointsplat_ns.pruning.merging.cells import Scratch
+from pointsplat_ns.scene.discovery import FOLDER_FILES
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -133,3 +139,130 @@ def test_each_place_that_starts_processes_is_known():
     assert found == {
         "pointsplat_ns/system/workers.py"
     }  # Python itself, without the current folder on its path
+
+
+HALF = ("--keep", "50%", "--by", "opacity", "--resolution", "32x24")
+FOLDER = ("compact", "scenes", *HALF, "--effort", "instant", "--picture", "all.png", "--force")
+
+LINKS = {
+    "room_pruned.ply": ("prune", "room.ply", *HALF, "--force"),
+    "room_clean.ply": ("clean", "room.ply", "--strength", "0", "--force"),
+    "room_web.html": ("compact", "room.ply", "--for", "web", "--effort", "instant", "--force"),
+    "room.mp4": (
+        *("render", "room.ply", "--width", "16", "--height", "12"),
+        "--seconds",
+        "0.1",
+        "--force",
+    ),
+    "room_tradeoff/tradeoff.html": (
+        *("tradeoff", "room.ply", "--keep", "50%", "--repairs", "none"),
+        *("--views", "2", "--resolution", "32x24", "--force"),
+    ),
+    "room_lod/level_0.ply": ("lod", "room.ply", "--levels", "50%", "--force"),
+    "room_stream/0_0/meta.json": ("lod", "room.ply", "--levels", "50%", "--stream", "--force"),
+    "room_tiles/tileset.json": ("lod", "room.ply", "--levels", "50%", "--tiles", "--force"),
+    "scenes_compact/1.ply": FOLDER,
+    "scenes_compact/1.ply.json": FOLDER,
+    "scenes_compact/1.ply.png": FOLDER,
+    f"scenes_compact/{FOLDER_FILES.scenes}": FOLDER,
+    f"scenes_compact/{FOLDER_FILES.scenes_table}": FOLDER,
+    ".room_compact.ply.unfinished": ("compact", "room.ply", *HALF, "--force"),
+}
+"""Commands by a file that they write, or remove, and that nobody named."""
+
+
+@pytest.fixture()
+def secret(tmp_path, monkeypatch) -> Path:
+    """A user's file outside of the current folder, which has a scene, and a folder of another."""
+    path = tmp_path / "secret"
+    path.write_text("secret")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    scene = ball(150, log_size=-1.0, opacity=1.0, bright=1.0)
+    ps.save(scene, "room.ply")
+    ps.save(scene, "scenes/1.ply")
+    return path
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_nothing_is_written_or_removed_through_a_link_that_nobody_named(name, secret, monkeypatch):
+    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)  # the state of a repair is written at once
+    monkeypatch.setitem(repair_budget.STEPS, "quick", 4)
+    link = Path(name)
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(secret)
+    main([*LINKS[name]])
+    assert secret.read_text() == "secret"
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize("name", [name for name in LINKS if "/" in name])
+def test_no_folder_that_nobody_named_is_a_link(name, secret, capsys):
+    user = secret.with_name("user")
+    user.mkdir()
+    folder = Path(name).parts[0]
+    Path(folder).symlink_to(user)
+    with pytest.raises(SystemExit) as end:
+        main([*LINKS[name]])
+    assert end.value.code == 1
+    assert f"{folder}: a link to {user}" in capsys.readouterr().err
+    assert list(user.iterdir()) == []
+
+
+def test_a_folder_of_results_has_no_links_in_it(secret, capsys):
+    user = secret.with_name("user")
+    user.mkdir()
+    shutil.copytree("scenes", "scenes/more")
+    Path("scenes_compact").mkdir()
+    Path("scenes_compact/more").symlink_to(user)
+    with pytest.raises(SystemExit) as end:
+        main([*FOLDER])
+    assert end.value.code == 1 and "1 of 2 scenes failed" in capsys.readouterr().err
+    assert list(user.iterdir()) == []
+
+
+def test_a_result_with_its_record_is_not_replaced_through_a_link(secret, capsys):
+    words = [word for word in FOLDER if word != "--force"]
+    main(words)
+    shutil.move("scenes_compact/1.ply", secret)
+    Path("scenes_compact/1.ply").symlink_to(secret)
+    before = secret.read_bytes()
+    ps.save(ball(60, opacity=1.0, bright=1.0), "scenes/1.ply", overwrite=True)
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "1.ply: exists already" in capsys.readouterr().out
+    main([*FOLDER])
+    assert secret.read_bytes() == before
+    assert len(ps.load("scenes_compact/1.ply")) == 30
+
+
+def test_the_state_of_a_repair_is_not_read_through_a_link(secret, monkeypatch):
+    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)
+    scene = normal_scene(8)
+    state = dict(scene.items())
+    Unfinished(secret, scene, "work").save(3, lambda: state)
+    assert Unfinished(secret, scene, "work").state(state) is not None
+    link = Path(".room_compact.ply.unfinished")
+    link.symlink_to(secret)
+    assert Unfinished(link, scene, "work").state(state) is None
+
+
+@pytest.mark.parametrize("planted", ["folder", "step"])
+def test_steps_of_merging_in_cells_are_not_read_or_written_through_a_link(planted, secret):
+    folder = Path(".room_pruned.ply.cells")
+    scene = dict(normal_scene(8).items())
+    user = secret.with_name("user")
+    made = Scratch(user, {"work": 1}).tensors("a", lambda: scene)
+    before = {path.name: path.read_bytes() for path in user.iterdir()}
+    if planted == "folder":
+        folder.symlink_to(user)
+    else:
+        shutil.copytree(user, folder)
+        (folder / "a.safetensors").unlink()
+        (folder / "a.safetensors").symlink_to(user / "a.safetensors")
+    other = {name: 0 * value for name, value in made.items()}
+    assert all(
+        not bool(value.any())
+        for value in Scratch(folder, {"work": 1}).tensors("a", lambda: other).values()
+    )
+    assert {path.name: path.read_bytes() for path in user.iterdir()} == before

@@ -11,10 +11,12 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, box_room
-from pointsplat_ns import view_source
 from pointsplat_ns.cli import main
-from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.pipeline import view_provider
+from pointsplat_ns.system.files import bytes_text
+from pointsplat_ns.view_sampling.sampler import sample_views
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 COUNT = 60
 
@@ -64,7 +66,7 @@ def test_lod_and_tradeoff_print_their_files(ply, as_json, tmp_path, monkeypatch)
     }
     views = sample_views(box_room(0, COUNT), 2, 24, 18)
     monkeypatch.setattr(
-        view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count]
+        view_provider.Sampler, "views", lambda sampler, count, *_, **options: views[:count]
     )
     few = ("--views", "2", "--repairs", "none", "--keep", "10%")
     assert as_json("tradeoff", ply, *few) == {

@@ -15,11 +15,14 @@ from refusing import refusal, run
 import pointsplat_ns as ps
 from killing import KILLED_AFTER_STEPS
 from making import ball, normal_scene, quick_start, run_of
-from pointsplat_ns.compression import prune_file
-from pointsplat_ns.io import read_ply, read_scene, write_ply
-from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.pipeline import prune_file
 from pointsplat_ns.pruning import METHODS
+from pointsplat_ns.scene.ply import read_ply, write_ply
+from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.view_sampling.sampler import sample_views
 from posing import inria, written
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 SEED = 5
 
@@ -134,7 +137,7 @@ def test_where_memory_is_short_a_scene_is_merged_in_parts_unasked(tmp_path, caps
 
 PROGRAM = """
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import prune_file
+from pointsplat_ns.pipeline import prune_file
 prune_file.MEMORY = prune_file.MemorySettings(base=0, least=100)
 killed_after_steps(int(sys.argv[1]))
 main(["prune", "scene.ply", "--keep", "10%", *sys.argv[2:]])

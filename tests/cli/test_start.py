@@ -1,11 +1,13 @@
 """The first moments of the program."""
 
 import resource
+import signal
 import subprocess
 import sys
 
 import pytest
 
+import pointsplat_ns as ps
 from pointsplat_ns.cli import main
 
 INTERRUPTED = """
@@ -39,14 +41,21 @@ def test_next_to_nothing_is_imported_before_ctrl_c_is_caught():
         "print(*sorted({*sys.modules} - before))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    by_python = {
-        "__future__",
-        "importlib",
-        "importlib._bootstrap",
-        "importlib._bootstrap_external",
-        "warnings",
+    light = {
+        "signal",
+        "enum",
+        "types",
+        "functools",
+        "operator",
+        "reprlib",
+        "collections",
+        "keyword",
     }
-    assert {*done.stdout.split()} - by_python == {"pointsplat_ns", "pointsplat_ns.start"}
+    light |= {"itertools", "__future__", "importlib", "warnings", "abc", "re", "typing"}
+    named = {
+        name for name in done.stdout.split() if name.partition(".")[0].lstrip("_") not in light
+    }
+    assert named - {"__future__"} == {"pointsplat_ns", "pointsplat_ns.start"}
 
 
 def test_files_that_are_missing_are_all_named_before_torch_is_imported(tmp_path):
@@ -114,3 +123,57 @@ def test_an_empty_path_is_not_the_current_folder(words, tmp_path, monkeypatch, c
         main(words)
     assert end.value.code == 2 and "parsing" in capsys.readouterr().err
     assert not [*tmp_path.iterdir()]
+
+
+SIGNALLED = """
+import os, signal, sys, threading, time
+from pointsplat_ns.start import program
+number, seconds = int(sys.argv[1]), float(sys.argv[2])
+sys.argv[1:] = ["info", "room.ply"]
+threading.Thread(
+    target=lambda: (time.sleep(seconds), os.kill(os.getpid(), number)), daemon=True
+).start()
+program()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_libraries_are_imported_ends_the_program_as_later(number, tmp_path):
+    """Files of a thousand Gaussians and more, so that it is not over before the last signal."""
+    ps.save(ps.example_room(), tmp_path / "room.ply")
+    for seconds in (0.1, 0.3, 0.6):
+        done = subprocess.run(
+            [sys.executable, "-c", SIGNALLED, str(int(number)), str(seconds)],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+        )
+        said = "interrupted\n" if number == signal.SIGINT else ""
+        assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", said), seconds
+
+
+DURING_IMPORT = """
+import os, signal, sys
+class Signal:
+    def find_spec(self, name, path, target=None):
+        if name == "numpy.linalg":
+            os.kill(os.getpid(), int(number))
+sys.meta_path.insert(0, Signal())
+number = sys.argv[1]
+from pointsplat_ns.start import program
+sys.argv[1:] = ["info", "room.ply"]
+program()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_the_middle_of_an_import_waits_for_its_end(number, tmp_path):
+    ps.save(ps.example_room()[::50], tmp_path / "room.ply")
+    done = subprocess.run(
+        [sys.executable, "-c", DURING_IMPORT, str(int(number))],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    said = "interrupted\n" if number == signal.SIGINT else ""
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", said)

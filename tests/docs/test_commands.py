@@ -26,6 +26,8 @@ from documented import (
 )
 from pointsplat_ns.cli.help import EXAMPLES
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-print-completion"}
 """Options that the documentation names and that belong to programs of others."""
 
@@ -147,15 +149,7 @@ def test_python_examples_run(page, cut_room, tmp_path, monkeypatch):
             exec(compile(block.text, block.where, "exec"), names)
 
 
-def test_readme_and_pages_for_users_are_short():
-    docs = ROOT / "docs"
-    folders = {docs, docs / "concepts", docs / "first_hour", docs / "guides"}
-    most = {ROOT / "README.md": 450, **{page: 900 for page in PAGES if page.parent in folders}}
-    counts = {page: len(page.read_text("utf-8").split()) for page in most}
-    assert not {str(page): count for page, count in counts.items() if count > most[page]}
-
-
-def test_options_named_in_text_exist(monkeypatch, capsys):
+def test_options_named_in_text_and_promised_by_the_changelog_exist(monkeypatch, capsys):
     programs = [("pointsplat", name) for name in EXAMPLES]
     programs += [
         ("ns-train", "pointsplat"),
@@ -172,7 +166,12 @@ def test_options_named_in_text_exist(monkeypatch, capsys):
     ]
     helps = "\n".join(help_of(words, monkeypatch, capsys) for words in programs)
     known = set(re.findall(r"--[a-z][\w.-]*", helps)) | OF_OTHERS | {"--help"}
-    for page, code in inline_code():
+    promised = (ROOT / "CHANGELOG.md").read_text("utf-8").partition("### Removed")[0]
+    codes = [
+        *inline_code(),
+        *((ROOT / "CHANGELOG.md", code) for code in re.findall(r"`([^`\n]+)`", promised)),
+    ]
+    for page, code in codes:
         unknown = set(re.findall(r"(?<!\S)--[a-z][\w.-]*", code)) - known
         assert not unknown, page.name
 

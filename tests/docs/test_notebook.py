@@ -5,22 +5,20 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
-from quick_looking import QUICK
-
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "quickstart.ipynb"
 
-SMALLER = f"""
+SMALLER = """
 import pointsplat_ns as ps
 from pointsplat_ns import api
-from pointsplat_ns.compression import repair
-from pointsplat_ns import view_source
-from pointsplat_ns.looking import settings
+from pointsplat_ns.pipeline import repair
+from pointsplat_ns.pipeline import view_provider
 
 ps.save(ps.example_room()[::30], "room.ply")
-api.EXAMPLE, repair.STEPS["quick"], view_source.RESOLUTION = "room.ply", 2, (64, 48)
-settings.changed({QUICK}).__enter__()
+api.EXAMPLE = "room.ply"
+repair.STEPS["quick"] = 2
+view_provider.RESOLUTION = (64, 48)
 """
-"""Run before all cells: the scene that ships cut to a thirtieth, a repair of two steps, few and
+"""Run before all cells: the scene that ships cut to a thirtieth, a repair of two steps,
 small views."""
 
 

@@ -13,7 +13,7 @@ from pointsplat_ns.geometry.transforms import (
     unit_rows,
     zero_as_identity,
 )
-from pointsplat_ns.refiner.refiner import canonical_quats
+from pointsplat_ns.refinement.refiner import canonical_quats
 
 
 def random_quats(n=200, dtype=torch.float64):

@@ -6,6 +6,8 @@ import torch
 import golden
 from lab.speed import cuda
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 def test_every_check_passes_where_both_devices_are_the_cpu(coarse_rooms, capsys):
     with pytest.raises(SystemExit) as ended:

@@ -10,7 +10,9 @@ from documented import start
 from lab import demo as module
 from making import ball, write_run
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.scene.ply import read_ply, write_ply
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture()

@@ -8,7 +8,9 @@ import torch
 
 from lab import feedback_training
 from lab.feedback_training import FeedbackTrainingSettings, TrainingScene, roll_out, train_feedback
-from pointsplat_ns.refiner.feedback import FeedbackRefiner, read_feedback_refiner
+from pointsplat_ns.refinement.feedback import FeedbackRefiner, read_feedback_refiner
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.fixture(scope="module")

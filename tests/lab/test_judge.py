@@ -25,9 +25,12 @@ from lab.judge import bytes as equal_bytes
 from making import box_room, move_zero_layers, run_of
 from peers import peer
 from pointsplat_ns.cli import main
-from pointsplat_ns.io import read_scene, write_ply
-from pointsplat_ns.merging import MERGING, merge
-from pointsplat_ns.refiner import Refiner, preset, save_refiner
+from pointsplat_ns.pruning.merging import MERGING, merge
+from pointsplat_ns.refinement import Refiner, preset, save_refiner
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.scene.reading import read_scene
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 VIEWS = {
     "scene": "small",

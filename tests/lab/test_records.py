@@ -5,15 +5,14 @@ import json
 import pytest
 import torch
 
+from lab.common.printing import put_between
 from lab.judge import ablation, large, record, tables_record
 from lab.judge.record import FOLDER as RECORD
 from lab.numerics import cases, report, stability
 from lab.speed import beside, rasterizer
 from making import box_room
 from peers import peer
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.looking.settings import changed
-from quick_looking import USUAL
+from pointsplat_ns.scene.ply import write_ply
 
 JUDGED = RECORD / "judge.json", RECORD / "judge_photos.json"
 
@@ -30,8 +29,7 @@ PAGES = {
 
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_of_the_record_is_what_its_program_writes_from_the_rows(name):
-    with changed(USUAL):
-        assert PAGES[name]() == (RECORD / name).read_text("utf-8")
+    assert PAGES[name]() == (RECORD / name).read_text("utf-8")
 
 
 def test_the_table_of_the_readme_is_that_of_the_record_which_is_small():
@@ -39,7 +37,7 @@ def test_the_table_of_the_readme_is_that_of_the_record_which_is_small():
     rows, _ = record.read(JUDGED)
     readme = record.ROOT / "README.md"
     text = readme.read_text("utf-8")
-    assert record.put_between(text, record.readme_table(rows), readme) == text
+    assert put_between(text, record.readme_table(rows), readme, record.README_TABLE) == text
 
 
 def test_both_programs_are_timed_at_each_budget_and_what_is_there_is_kept(

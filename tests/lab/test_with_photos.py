@@ -10,6 +10,8 @@ from lab.training import with_photos as program
 from lab.training.score_and_train import CpuBudget
 from lab.training.with_photos import METHODS
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 class Tried(program.Capture):
     """A capture of which nothing is trained."""

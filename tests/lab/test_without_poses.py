@@ -16,8 +16,10 @@ from lab.judge import captures, without_poses
 from lab.judge.scenes import load, losses
 from making import box_room, run_of
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import write_ply
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.scene.ply import write_ply
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 KNOWN = captures.Capture(
     "owner/name", "0" * 40, "images", "transforms.json", FRAMES, (WIDTH, HEIGHT), "room", "walls"

@@ -39,6 +39,28 @@ def test_gradients_agree_with_float64_differences(metric):
     )
 
 
+def test_the_gradient_of_psnr_of_a_batch_is_that_of_each_image_alone():
+    a, b = (image.requires_grad_() for image in pair(3, 5, 7, dtype=torch.float64))
+    assert torch.autograd.gradcheck(psnr, (a, b))
+    together = torch.autograd.grad(psnr(a, b).sum(), a)[0]
+    alone = torch.stack([torch.autograd.grad(psnr(x, y), x)[0] for x, y in zip(a, b, strict=True)])
+    assert torch.equal(together, alone)
+
+
+@pytest.mark.parametrize("error", [1e-150, 1e-12, 1e-4, 1.0, 1e6, 1e150])
+def test_gradients_of_psnr_are_those_of_its_formula_at_all_extremes(error):
+    """-20 / ln 10 times the difference, divided by the sum of its squares."""
+    difference = error * torch.tensor([[[1.0, -0.5, 0.25], [0.0, 0.75, -1.0]]]).double()
+    a = difference.clone().requires_grad_()
+    b = torch.zeros_like(difference, requires_grad=True)
+    psnr(a, b).backward()
+    unit = difference / error
+    expected = -20 / math.log(10) * unit / unit.square().sum()
+    # 1e-12: some roundings of float64
+    assert torch.allclose(a.grad * error, expected, rtol=1e-12, atol=0)
+    assert torch.equal(b.grad, -a.grad)
+
+
 @pytest.mark.parametrize("metric", [psnr, ssim])
 @pytest.mark.parametrize(
     ("a", "b", "message"),

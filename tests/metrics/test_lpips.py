@@ -185,6 +185,34 @@ def test_weights_are_found_by_the_variable(alex_file, alex, monkeypatch, nowhere
         load_lpips("vgg")
 
 
+@pytest.mark.parametrize(
+    ("net", "name"), [("alex", "alexnet-owt-7be5be79.pth"), ("vgg", "vgg16-397923af.pth")]
+)
+def test_weights_are_found_in_the_cache_of_torch_hub(net, name, tmp_path, nowhere):
+    """Under the names that torchvision gives its downloads, which other programs left there."""
+    state = random_backbone(net)
+    cached = tmp_path / "hub" / "checkpoints" / name
+    cached.parent.mkdir(parents=True)
+    torch.save(state, cached)
+    found = load_lpips(net).state_dict()["network.net.slice1.0.weight"]
+    assert torch.equal(found, state["features.0.weight"])
+    assert nowhere == []
+
+
+def test_weights_that_the_variable_names_come_before_those_of_the_hub(
+    alex_file, alex, tmp_path, monkeypatch, nowhere
+):
+    cached = tmp_path / "hub" / "checkpoints" / "alexnet-owt-7be5be79.pth"
+    cached.parent.mkdir(parents=True)
+    other = {name: value + 1 for name, value in random_backbone("alex").items()}
+    torch.save(other, cached)
+    first = "network.net.slice1.0.weight"
+    assert torch.equal(load_lpips("alex").state_dict()[first], other["features.0.weight"])
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file.parent))
+    assert torch.equal(load_lpips("alex").state_dict()[first], alex.state_dict()[first])
+    assert nowhere == []
+
+
 class Answer(BytesIO):
     """What a proxy might send in place of the weights."""
 
@@ -241,7 +269,7 @@ def test_files_that_are_no_backbone_are_said(alex_file, tmp_path, content, messa
 def test_a_folder_that_is_named_and_not_there_is_said(tmp_path, monkeypatch, nowhere):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "gone"))
     with pytest.raises(
-        LpipsUnavailable, match=f"gone: no such folder, though {WEIGHTS_VARIABLE} names it"
+        LpipsUnavailable, match=f"gone: no such folder; {WEIGHTS_VARIABLE} names it"
     ):
         load_lpips()
     with pytest.raises(

@@ -20,15 +20,17 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from making import run_of
-from pointsplat_ns.compression.requests import PHOTO_STEPS
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, carried, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, UndistortedDataset
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
-from pointsplat_ns.views import EPS2D, NEAR_PLANE, Views
+from pointsplat_ns.pipeline.repair_budget import PHOTO_STEPS
+from pointsplat_ns.scene.image_files import in_unit_range
+from pointsplat_ns.scene.views import EPS2D, NEAR_PLANE, Views
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
@@ -284,7 +286,7 @@ def test_a_photo_that_its_exif_turns_is_said(tmp_path, orientation, hint):
     exif = Image.Exif()
     exif[274] = orientation
     Image.new("RGB", (HEIGHT, WIDTH)).save(dataset.image_filenames[2], exif=exif)
-    with pytest.raises(DataError, match=f"photo2.png: .* pixels, but its camera says .*{hint}"):
+    with pytest.raises(DataError, match=f"photo2.png: .* pixels, but its camera is for .*{hint}"):
         Frames(dataset)[2]
 
 

@@ -18,6 +18,8 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture
 def runs(trained_walls, tmp_path) -> Path:

@@ -8,16 +8,19 @@ import torch
 
 import pointsplat_ns as ps
 from making import SHARED_DATA
-from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
+from pointsplat_ns.scene.image_files import in_unit_range
+from pointsplat_ns.scene.runs import open_run
 
 RUN = SHARED_DATA / "splatfacto" / "fox" / "splatfacto" / "2026-11-26_gsplat"
 CAPTURE = SHARED_DATA / "scannetpp" / "fox"
 
-pytestmark = pytest.mark.skipif(
-    not RUN.is_dir() or not CAPTURE.is_dir(), reason="the genuine run is not at hand"
-)
+pytestmark = [
+    pytest.mark.usefixtures("quick"),
+    pytest.mark.skipif(
+        not RUN.is_dir() or not CAPTURE.is_dir(), reason="the genuine run is not at hand"
+    ),
+]
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,8 @@ from ns_viewer import Look, look
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainer
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 STEPS = {"splatfacto-cpu": 20, "pointsplat": 4}
 VIEWER = ("--viewer.websocket-host", "127.0.0.1", "--viewer.image-format", "png")
 WIDTH = 40

@@ -73,7 +73,7 @@ def test_warnings_for_nerfstudio_are_hidden_and_all_others_are_printed():
         for module in (
             "nerfstudio.engine.trainer",
             "nerfstudio_of_another",
-            "pointsplat_ns.io.nerfstudio.x",
+            "pointsplat_ns.scene.nerfstudio.x",
         ):
             warnings.warn_explicit(
                 "it is deprecated", FutureWarning, f"{module}.py", 1, module=module
@@ -83,6 +83,6 @@ def test_warnings_for_nerfstudio_are_hidden_and_all_others_are_printed():
         )
     assert [(warning.filename, warning.category) for warning in caught] == [
         ("nerfstudio_of_another.py", FutureWarning),
-        ("pointsplat_ns.io.nerfstudio.x.py", FutureWarning),
+        ("pointsplat_ns.scene.nerfstudio.x.py", FutureWarning),
         ("a.py", RuntimeWarning),
     ]

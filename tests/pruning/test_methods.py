@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 from making import normal_scene, same, same_bits
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.pruning import (
     METHODS,
     Megabytes,
@@ -24,7 +22,9 @@ from pointsplat_ns.pruning import (
     score_of,
     select,
 )
-from pointsplat_ns.views import Views
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.view_sampling.poses import look_at, views_of
 
 SCORES = [name for name, method in METHODS.items() if method.score and not method.needs_views]
 
@@ -92,7 +92,7 @@ def test_a_scene_with_no_gaussian_or_none_that_can_be_drawn_is_refused(by):
     [
         ("best", {}, UNKNOWN),
         *(
-            (by, {"views": None}, f"{by} looks at the scene from poses; expected views")
+            (by, {"views": None}, f"{by} needs views of the scene; expected views")
             for by in WITH_VIEWS
         ),
         *(
@@ -123,7 +123,7 @@ def test_settings_prune_as_prune_does(keep, count):
             for keep in (0, -1, 1.5, 7.25, math.nan)
         ),
         *(
-            ({"by": by}, f"{by} looks at a scene from poses; expected a method that needs none")
+            ({"by": by}, f"{by} needs views of the scene; expected a method that needs none")
             for by in WITH_VIEWS
         ),
         ({"by": "best"}, UNKNOWN),
@@ -164,8 +164,8 @@ def test_a_float_is_a_ratio_and_an_int_is_a_count(n, keep, k):
         *((1000, keep, f"keep is {keep} Gaussians; expected at least 1") for keep in (0, -1)),
         (1000, Megabytes(1e-6), "keep is 1e-06MB, too small for one Gaussian"),
         *((0, keep, "holds no Gaussians") for keep in (1, 0.5, Megabytes(1.0))),
-        (1000, WithinPsnr(35.0), "found by rendering"),
-        (1000, Megabytes(1.0, ".sog"), "found by writing"),
+        (1000, WithinPsnr(35.0), "needs rendering"),
+        (1000, Megabytes(1.0, ".sog"), "needs writing"),
     ],
 )
 def test_a_budget_that_fits_no_count_of_the_scene_is_refused(n, keep, message):
@@ -219,7 +219,7 @@ def test_few_gaussians_of_many_are_asked_about_unless_they_are_called_so():
     ):
         assert resolve_keep(n, text) == kept
     assert resolve_keep(5000, 10) == 10
-    wanted = r"keep is 10, of 5,000 Gaussians; did you mean 10%\? Write 10gaussians for so few"
+    wanted = r"keep is 10, of 5,000 Gaussians; did you mean 10%\? Write 10gaussians if you mean that count"
     with pytest.raises(BudgetError, match=wanted):
         resolve_keep(5000, "10")
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from making import normal_scene, splats
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import METHODS, prune, score_of, select
 from pointsplat_ns.pruning.baselines import mass_shares
+from pointsplat_ns.scene.gaussians import Gaussians
 
 SCORES = {
     name: method.score

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from making import normal_scene
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import band_energies, cut_sh, energy_lost
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.rendering.spherical_harmonics import sh_basis
+from pointsplat_ns.scene.gaussians import Gaussians
 
 
 def test_energies_are_mean_squares_over_the_sphere_and_lost_shares_add_up():

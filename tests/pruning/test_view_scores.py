@@ -14,8 +14,8 @@ from pointsplat_ns.pruning.view_scores import (
     pup_score,
     sensitivity,
 )
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import Views
+from pointsplat_ns.rendering import render
+from pointsplat_ns.scene.views import Views
 
 # four tiles, three of them cut off
 WIDTH = 10

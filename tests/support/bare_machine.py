@@ -13,8 +13,7 @@ import sys
 import traceback
 from contextlib import redirect_stderr, redirect_stdout
 
-from pointsplat_ns.looking.settings import changed
-from quick_looking import QUICK
+from quick import quick_settings
 
 tried: list[str] = []
 
@@ -45,8 +44,5 @@ def outcome(words: list[str]) -> dict:
 
 if __name__ == "__main__":
     sys.addaudithook(no_network)
-    from pointsplat_ns import view_source
-
-    view_source.RESOLUTION = (64, 48)
-    with changed(QUICK):
+    with quick_settings():
         print(json.dumps([outcome(words) for words in json.load(sys.stdin)]))

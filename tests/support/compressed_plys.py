@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.formats.coding import smallest_three, unit_quats
-from pointsplat_ns.io.ply_header import first_lines
+from pointsplat_ns.scene.formats.coding import smallest_three, unit_quats
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply_header import first_lines
 
 
 def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:

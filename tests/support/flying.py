@@ -10,7 +10,7 @@ from torch import Tensor
 
 import pointsplat_ns as ps
 from browser import waited
-from pointsplat_ns.pages.flight import FlightFrame
+from pointsplat_ns.tools.pages.flight import FlightFrame
 
 
 def until(browser, condition: str) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import zstandard
 
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats.sog import encode_sog
-from pointsplat_ns.io.formats.spz import encode_spz
+from pointsplat_ns.scene.formats.sog import encode_sog
+from pointsplat_ns.scene.formats.spz import encode_spz
+from pointsplat_ns.scene.gaussians import Gaussians
 
 
 def encode_spz4(scene: Gaussians, extensions: bytes = b"") -> bytes:

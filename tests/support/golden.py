@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lab.numerics.reference import rasterize_reference
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rendering import rasterization
 
 # twelve tiles, some of them cut off: compiled kernels are used from eight on
 WIDTH = 26

@@ -14,12 +14,12 @@ from unittest import mock
 import numpy as np
 import torch
 
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.poses import look_at, views_of
-from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.threads import fixed_threads
-from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.views import Views
+from pointsplat_ns.view_sampling.poses import look_at, views_of
+from pointsplat_ns.view_sampling.sampler import sample_views
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -137,7 +137,7 @@ EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])
 def photographed(n: int = 600, degree: int = 3, eyes: torch.Tensor = EYES) -> Gaussians:
     """A ball whose SH were moved along the basis in the directions that eyes see it from, by random
     steps."""
-    from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+    from pointsplat_ns.rendering.spherical_harmonics import sh_basis
 
     scene = ball(n, degree)
     generator = torch.Generator().manual_seed(1)
@@ -199,7 +199,7 @@ def camera_askew(
 def small_refiner(trained: bool = True, seed: int = 0, **changes):
     """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that
     residuals are not zero."""
-    from pointsplat_ns.refiner import Refiner, preset
+    from pointsplat_ns.refinement import Refiner, preset
 
     sizes = {
         "strides": (2,),
@@ -356,7 +356,7 @@ def decoded(path: Path) -> list[np.ndarray]:
     return [frame.to_ndarray() for frame in frames]
 
 
-class FewViews(ViewSource):
+class FewViews(ViewProvider):
     """Fresh views of 48 x 36 pixels."""
 
     def sampled(self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = 320):

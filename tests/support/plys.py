@@ -3,7 +3,7 @@
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from pointsplat_ns.io.ply import column_names, row_table
+from pointsplat_ns.scene.ply import column_names, row_table
 
 
 def columns_of(scene):

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid, viewmats_to_opengl
-from pointsplat_ns.io.pictures import write_picture
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import Views
+from pointsplat_ns.rendering import render
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.image_files import write_picture
+from pointsplat_ns.scene.views import Views
 
 
 def name_of(index: int) -> str:

@@ -3,7 +3,7 @@
 import torch
 
 import pointsplat_ns as ps
-from pointsplat_ns.looking.poses import look_at
+from pointsplat_ns.view_sampling.poses import look_at
 
 
 def room_views(width: int = 64, height: int = 48) -> ps.Views:

@@ -2,7 +2,7 @@
 
 import math
 
-from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Speed
+from pointsplat_ns.tools.tradeoff.points import ImageMetrics, Point, Speed
 
 
 def point(key: str, ms: float, psnr: float, photos: float | None, count: int) -> Point:

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from making import splats
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.scene.gaussians import Gaussians
 
 TURNS = [Rotation.identity(), *(Rotation.random(random_state=seed) for seed in range(4))]
 

@@ -5,14 +5,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 import pointsplat_ns as ps
 from making import box_room, move_zero_layers
-from pointsplat_ns.compression import repair
+from pointsplat_ns.pipeline import repair
 from pointsplat_ns.pruning.methods import METHODS
-from pointsplat_ns.refiner import Refiner, preset, save_refiner
+from pointsplat_ns.refinement import Refiner, preset, save_refiner
 from pointsplat_ns.system.threads import fixed_threads
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Kernels, which an installation builds where there is a compiler; cores and threads."""
 
 import ctypes
+import importlib
 import math
 import os
 import re
@@ -8,6 +9,7 @@ import shutil
 import subprocess
 import threading
 import time
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -17,7 +19,17 @@ import torch
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system import kernels
 from pointsplat_ns.system.cores import cores, cpu_quota
-from pointsplat_ns.system.kernels import KERNELS, Kernels, structs_of
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    FUNCTIONS,
+    INT64_POINTER,
+    KERNELS,
+    Function,
+    Kernels,
+    Pointer,
+    Struct,
+)
 from pointsplat_ns.system.native import INCLUDE, IS_X86, cpp_files, library_path
 from pointsplat_ns.system.threads import fixed_threads
 
@@ -26,36 +38,187 @@ COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler")
 
 
+CALLERS = (
+    "metrics.structural_similarity",
+    "pipeline.optimiser",
+    "pruning.merging.covariance",
+    "pruning.merging.pair_cost",
+    "pruning.merging.regrouping",
+    "rendering.compiled.blending",
+    "rendering.compiled.tiles",
+    "rendering.projection",
+    "rendering.spherical_harmonics",
+    "rendering.whole_pictures",
+)
+"""Modules that declare functions of C++ files."""
+
+for name in CALLERS:
+    importlib.import_module(f"pointsplat_ns.{name}")
+
+CPP_NAMES: dict[object, str] = {
+    None: "void",
+    ctypes.c_int: "int",
+    ctypes.c_int32: "int32_t",
+    ctypes.c_int64: "int64_t",
+    ctypes.c_float: "float",
+    ctypes.c_double: "double",
+    torch.float32: "float*",
+    torch.float64: "double*",
+    torch.int32: "int32_t*",
+    torch.int64: "int64_t*",
+}
+
+SAME = """
+#include <cstddef>
+#include <cstdint>
+#include <type_traits>
+template <class T> struct plain { using type = std::remove_all_extents_t<T>; };
+template <class T> struct plain<const T*> { using type = T*; };
+template <class R, class... A> struct plain<R(A...)> { using type = R(typename plain<A>::type...); };
+template <class T, class Expected> constexpr bool same = std::is_same_v<typename plain<T>::type, Expected>;
+template <class T> constexpr bool points_to_struct =
+    std::is_pointer_v<T> && std::is_class_v<std::remove_pointer_t<T>>;
+"""
+"""Compares types but for ``const``, and arrays by their numbers."""
+
+
+def cpp_name(kind: object) -> str:
+    """The C++ type of a declared one; of a struct its name, of an array its numbers' type."""
+    if isinstance(kind, Pointer):
+        return CPP_NAMES[kind.dtype]
+    if isinstance(kind, type) and issubclass(kind, Struct):
+        return kind.__name__.removesuffix("Struct")
+    return CPP_NAMES[getattr(kind, "_type_", kind) if is_array(kind) else kind]
+
+
+def is_array(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, ctypes.Array)
+
+
+def structs_in(kinds: Iterable[object]) -> dict[str, type[Struct]]:
+    """The structs among some types and their members, by their C++ names."""
+    found: dict[str, type[Struct]] = {}
+    for kind in kinds:
+        if isinstance(kind, type) and issubclass(kind, Struct):
+            found |= structs_in(kind.members.values()) | {cpp_name(kind): kind}
+    return found
+
+
+def source_of(function: str) -> Path:
+    [source] = [path for path in cpp_files() if f" {function}(" in path.read_text("utf-8")]
+    return source
+
+
+def claims(function: Function) -> list[str]:
+    """What a compiler has to find true if a function and its structs are declared right."""
+    arguments = [
+        f"{cpp_name(kind)}*" if cpp_name(kind) in structs_in([kind]) else cpp_name(kind)
+        for kind in function.arguments
+    ]
+    expected = f"{cpp_name(function.result)}({', '.join(arguments)})"
+    lines = [f"same<decltype({function.name}), {expected}>"]
+    for name, struct in structs_in(function.arguments).items():
+        lines.append(f"sizeof({name}) == {ctypes.sizeof(struct)}")
+        for member, kind in struct.members.items():
+            place = getattr(struct, member)
+            declared = f"decltype({name}::{member})"
+            lines += [
+                f"offsetof({name}, {member}) == {place.offset}",
+                f"sizeof({declared}) == {place.size}",
+                f"points_to_struct<{declared}>"
+                if isinstance(kind, Pointer) and kind.dtype is None
+                else f"same<{declared}, {cpp_name(kind)}>",
+            ]
+    return lines
+
+
+def compiles(source: Path, lines: list[str], folder: Path) -> bool:
+    """Whether a compiler finds claims about a C++ file true."""
+    check = folder / "check.cpp"
+    asserted = [f"static_assert({line});" for line in lines]
+    check.write_text("\n".join([SAME, f'#include "{source}"', *asserted, ""]), "utf-8")
+    command = [COMPILER, "-std=c++17", "-fsyntax-only", f"-I{INCLUDE}", str(check)]
+    return subprocess.run(command, capture_output=True).returncode == 0
+
+
 @needs_compiler
 @pytest.mark.parametrize("source", cpp_files(), ids=lambda source: source.stem)
-def test_structs_are_laid_out_as_the_compiler_lays_them_out(source, tmp_path):
-    text = source.read_text("utf-8")
-    included = [source.with_name(name) for name in re.findall(r'^#include "(.+)"$', text, re.M)]
-    structs = structs_of(
-        "".join(path.read_text("utf-8") for path in (*included, source) if path.is_file())
-    )
-    assert structs
-    lines = ["#include <cstddef>", f'#include "{source}"']
-    for name, struct in structs.items():
-        lines.append(f"static_assert(sizeof({name}) == {ctypes.sizeof(struct)});")
-        places = {field: getattr(struct, field).offset for field, _ in struct._fields_}
-        lines += [
-            f"static_assert(offsetof({name}, {field}) == {place});"
-            for field, place in places.items()
-        ]
-    check = tmp_path / "check.cpp"
-    check.write_text("\n".join(lines) + "\n", "utf-8")
-    subprocess.run(
-        [COMPILER, "-std=c++17", "-fsyntax-only", f"-I{INCLUDE}", str(check)], check=True
-    )
+def test_functions_and_structs_are_declared_as_the_compiler_reads_them(source, tmp_path):
+    functions = [f for f in FUNCTIONS.values() if source_of(f.name) == source]
+    assert functions
+    assert compiles(source, [line for f in functions for line in claims(f)], tmp_path)
+
+
+def test_every_function_of_the_library_is_declared():
+    texts = [path.read_text("utf-8") for path in cpp_files()]
+    defined = {
+        name for text in texts for name in re.findall(r"^\w+ (pointsplat_\w+)\(", text, re.M)
+    }
+    assert defined == set(FUNCTIONS)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Function("pointsplat_by_depth", DOUBLE_POINTER, ctypes.c_int64, INT64_POINTER),
+        Function("pointsplat_by_depth", FLOAT_POINTER, ctypes.c_int32, INT64_POINTER),
+        Function("pointsplat_by_depth", FLOAT_POINTER, ctypes.c_int64),
+        Function(
+            "pointsplat_by_depth", FLOAT_POINTER, ctypes.c_int64, INT64_POINTER, result=ctypes.c_int
+        ),
+    ],
+    ids=["pointer", "width", "count", "result"],
+)
+def test_the_compiler_notices_a_wrong_declaration(wrong, tmp_path):
+    assert not compiles(source_of(wrong.name), claims(wrong), tmp_path)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def right_declarations():
+    """Those of the package, in place of the wrong ones that this module makes."""
+    from pointsplat_ns.rendering.compiled.tiles import by_depth_kernel
+
+    FUNCTIONS[by_depth_kernel.name] = by_depth_kernel
+
+
+@needs_compiler
+def test_a_call_with_other_arguments_than_declared_is_refused():
+    call = FUNCTIONS["pointsplat_by_depth"]
+    order = torch.empty(3, dtype=torch.int64)
+    call(torch.tensor([3.0, 1.0, 2.0]), 3, order)
+    assert order.tolist() == [1, 2, 0]
+    with pytest.raises(TypeError, match="2 arguments; expected 3"):
+        call(torch.zeros(3), 3)
+    with pytest.raises(TypeError, match="4 arguments; expected 3"):
+        call(torch.zeros(3), 3, order, None)
+    with pytest.raises(ctypes.ArgumentError, match="expected torch.float32"):
+        call(torch.zeros(3, dtype=torch.float64), 3, order)
+    with pytest.raises(ctypes.ArgumentError, match="contiguous"):
+        call(torch.zeros(3, 2)[:, 0], 3, order)
+    with pytest.raises(ctypes.ArgumentError):
+        call(torch.zeros(3), 3.5, order)
+
+
+def test_a_struct_takes_its_own_members_and_types_alone():
+    struct = {
+        cpp: kind for f in FUNCTIONS.values() for cpp, kind in structs_in(f.arguments).items()
+    }
+    shapes = struct["Shapes"]
+    with pytest.raises(AttributeError, match="ShapesStruct has no member scales"):
+        shapes(scales=torch.zeros(1, 3))
+    with pytest.raises(TypeError, match="expected torch.float32"):
+        shapes(log_scales=torch.zeros(1, 3).double())
+    with pytest.raises(TypeError, match="ChoiceStruct; expected ShapesStruct"):
+        shapes.from_param(struct["Choice"]())
 
 
 def test_a_library_that_is_missing_old_or_damaged_is_not_loaded(tmp_path):
-    how = "where there is a C++ compiler, installing builds them (in a clone: pip install -e .)"
+    how = "installing builds them if there is a C++ compiler (in a clone: pip install -e .)"
     library = tmp_path / "kernels.0123456789abcdef.so"
-    assert Kernels(library).why_missing == f"they were not built; {how}"
+    assert Kernels(library).why_missing == f"not built; {how}"
     (tmp_path / "kernels.0123456789abcdee.so").touch()
-    assert Kernels(library).why_missing == f"they were built from other sources; {how}"
+    assert Kernels(library).why_missing == f"built from other sources; {how}"
     library.write_bytes(b"no library")
     assert Kernels(library).why_missing.startswith(f"{library}: ")
 
@@ -63,7 +226,7 @@ def test_a_library_that_is_missing_old_or_damaged_is_not_loaded(tmp_path):
 @pytest.mark.skipif(not IS_X86, reason="other processors have all that the kernels need")
 def test_a_processor_without_avx2_loads_no_library(monkeypatch):
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "DEFAULT")
-    assert "no AVX2" in Kernels(library_path()).why_missing
+    assert "AVX2" in Kernels(library_path()).why_missing
 
 
 def test_a_change_of_any_source_gives_the_library_another_name(monkeypatch):

@@ -14,14 +14,13 @@ from nerfstudio.engine.trainer import Trainer
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import take_network_of
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
+from pointsplat_ns.scene.runs import METHOD_NAMES
 from pointsplat_ns.system.processes import (
-    by_first,
     connect_torchrun,
     gathered,
     local_rank,
@@ -71,8 +70,8 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
 
     steps_per_eval_batch: Suppress[Fixed[int]] = 0  # nerfstudio's, without effect here
 
-    def set_timestamp(self) -> None:
-        """As nerfstudio's; processes that ``torchrun`` started are connected here."""
+    def check(self) -> None:
+        """See the base class."""
         kind = self.machine.device_type
         number = self.machine.num_devices
         if kind != "cuda" and number > 1:
@@ -81,11 +80,21 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
                 "that are started by "
                 f"torchrun --nproc-per-node {number} --no-python ns-train {self.method_name}"
             )
+        for name in ("rate_factor", "drop_at", "seconds", "global_norm"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:  # NaN fails too
+                raise PointSplatError(
+                    f"--{name.replace('_', '-')} {value:g}: expected a finite number above 0"
+                )
+        super().check()
+
+    def set_timestamp(self) -> None:
+        """See the base class; processes that ``torchrun`` started are connected here."""
         if self.init is not None:
             assert isinstance(self.pipeline, PointSplatPipelineConfig)
             take_network_of(self.init, self.pipeline.model)
         super().set_timestamp()
-        connect_torchrun("nccl" if kind == "cuda" else "gloo")
+        connect_torchrun("nccl" if self.machine.device_type == "cuda" else "gloo")
 
     def print_to_terminal(self) -> None:
         """As nerfstudio's, by the first process."""
@@ -93,9 +102,8 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
             super().print_to_terminal()
 
     def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all, and by the first process, whose folder all
-        take."""
-        by_first(super().save_config)
+        """See the base class; all processes take the folder of the first."""
+        super().save_config()
         self.timestamp = gathered([self.timestamp])[0]
 
     def setup(self, **kwargs) -> Trainer:
@@ -104,12 +112,6 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes
         from, or when ``seconds`` are over, as if it had not been stopped.
         """
-        for name in ("rate_factor", "drop_at", "seconds", "global_norm"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:  # NaN fails too
-                raise PointSplatError(
-                    f"--{name.replace('_', '-')} {value:g}: expected a finite number above 0"
-                )
         config = copy.deepcopy(self)
         if config.seconds is not None:
             config.max_num_iterations = sys.maxsize
@@ -120,7 +122,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         _, together = torchrun_rank()
         if together > 1:  # nerfstudio, which did not start them, takes each for one alone
             kwargs |= {"local_rank": local_rank(), "world_size": together}
-        return self._target(config, **kwargs)
+        return self.trainer(config, **kwargs)
 
 
 def adam(rates: dict[str, float], eps: float, max_norm: float | None = None) -> dict[str, dict]:

@@ -11,11 +11,9 @@ from typing import Any, Literal
 import torch
 from nerfstudio.data.datamanagers.base_datamanager import DataManager, DataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys, shown_scene
-from pointsplat_ns.io.runs import open_run
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import (
@@ -26,6 +24,8 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import (
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 from pointsplat_ns.pruning import PruneSettings
+from pointsplat_ns.scene.discovery import Supervision, find_runs_and_plys, shown_scene
+from pointsplat_ns.scene.runs import open_run
 
 
 @dataclass
@@ -143,9 +143,7 @@ class ScenesDataManager(DataManager):
             or "no scene (held-out photos of the training scenes serve)"
         )
         targets = "photos" if self.supervision == "photos" else "renders of the dense scenes"
-        CONSOLE.log(
-            f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}"
-        )
+        log(f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}")
         super().__init__()
 
     def _found_scenes(self, folder: Path) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
@@ -187,7 +185,7 @@ class ScenesDataManager(DataManager):
                     has_photos = False
                     missing.append(f"{run.config_path}: its data {run.data} is not there")
                     what = "left out" if chosen == "photos" else "seen from sampled poses"
-                    CONSOLE.log(f"{name} is {what}: {missing[-1]}")
+                    log(f"{name} is {what}: {missing[-1]}")
             scene = TrainedScene(name, run, self.cache, config, self.device, has_photos)
             if has_photos and chosen == "photos" and self.test_mode != "inference":
                 scene.need_photos_as_rendered("take --pipeline.datamanager.supervision dense")
@@ -220,7 +218,8 @@ class ScenesDataManager(DataManager):
                 f"{config.cuts} cuts into pieces of {most} Gaussians with {config.piece_poses} "
                 "poses: expected at least 1 of each"
             )
-        large, small = [], []
+        large: list[int] = []
+        small: list[int] = []
         for index in self.train_indices:
             count = count_of(self.scenes[index])
             if count is not None:
@@ -284,7 +283,7 @@ class ScenesDataManager(DataManager):
         if index not in self._usable:
             why = piece.why_not(self.prune_settings)
             if why:
-                CONSOLE.log(f"{piece.name} is left out: {why}")
+                log(f"{piece.name} is left out: {why}")
             self._usable[index] = not why
         return self._usable[index]
 

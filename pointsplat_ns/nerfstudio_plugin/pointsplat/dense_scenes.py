@@ -14,18 +14,18 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from pointsplat_ns.comparing.sizes import RESOLUTION, subsampled
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.pruning import PruneSettings
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.sizes import RESOLUTION, subsampled
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.image_files import in_unit_range
+from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.scene.views import RasterizeMode
 from pointsplat_ns.system.tensors import FLOATS
-from pointsplat_ns.views import RasterizeMode
+from pointsplat_ns.view_sampling.sampler import sample_views
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig

@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.image_files import write_picture
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.system.terminal import print_table
+from pointsplat_ns.system.terminal import print_table, say
 from pointsplat_ns.system.threads import now
 
 if TYPE_CHECKING:
@@ -95,7 +95,8 @@ def evaluate_scene(
                 values[name][metric] += [] if value is None else [float(value)]
         picture = torch.cat(pictures, dim=1)
         if picture_folder is not None:
-            write_picture(picture, picture_folder / f"{scene.name}_{views:04d}.png")
+            name = f"{scene.name}_{views:04d}.png"
+            write_picture(picture, picture_folder / name, named=False)
         views += 1
     if views == 0:
         raise DataError(
@@ -185,9 +186,9 @@ def print_summary(summary: dict[str, Any]) -> None:
     )
     others = [name for name, scene in scenes.items() if scene["reference"] != reference]
     if others:
-        print(f"compared with {RENDERS}, and in no mean: {', '.join(others)}")
+        say(f"compared with {RENDERS}, and in no mean: {', '.join(others)}")
     if "lpips_note" in summary:
-        print(f"no LPIPS: {summary['lpips_note']}")
+        say(f"no LPIPS: {summary['lpips_note']}")
 
 
 def only_finite(values: dict[str, Any]) -> dict[str, float]:

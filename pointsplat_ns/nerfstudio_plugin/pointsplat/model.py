@@ -15,26 +15,26 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.splatfacto import SplatfactoModel
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from pointsplat_ns.compression.trained_refiner import (
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.geometry.transforms import viewmats_from_opengl
+from pointsplat_ns.metrics import PIXEL_LOSSES, ImageError, PixelLoss, psnr
+from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
+from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
+from pointsplat_ns.nerfstudio_plugin.console import log
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import ScenePiece
+from pointsplat_ns.pipeline.trained_refiner import (
     NETWORK_OPTIONS,
     load_refiner,
     network_options,
 )
-from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.metrics import PIXEL_LOSSES, ImageError, PixelLoss, psnr
-from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
-from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
-from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
-from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import ScenePiece
 from pointsplat_ns.pruning import PruneSettings
-from pointsplat_ns.refiner import Refiner, Structure, preset
-from pointsplat_ns.refiner.augmentation import random_transform
+from pointsplat_ns.refinement import Refiner, Structure, preset
+from pointsplat_ns.refinement.augmentation import random_transform
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.image_files import in_unit_range
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
@@ -213,7 +213,7 @@ class PointSplatModel(SplatfactoModel):
             except PointSplatError as error:
                 raise type(error)(f"{scene.source}: {error}") from error
             if not isinstance(scene, ScenePiece):
-                CONSOLE.log(f"{scene.name}: kept {len(smaller):,} Gaussians, {kept:.1%}")
+                log(f"{scene.name}: kept {len(smaller):,} Gaussians, {kept:.1%}")
             smaller = smaller.to(self.device)
             # An augmented piece gets tables of its own at each step.
             piece = self.config.augment and isinstance(scene, ScenePiece)
@@ -321,7 +321,7 @@ class PointSplatModel(SplatfactoModel):
                 ImageError,
             ) as error:  # no weights, or a picture too small for the network
                 self.no_lpips_reason = str(error)
-                CONSOLE.log(f"going on without LPIPS in the loss: {error}")
+                log(f"going on without LPIPS in the loss: {error}")
         quality = torch.stack([psnr(render.detach(), photo) for render, photo in pairs]).mean()
         return outputs, losses, {"psnr": quality, "gaussian_count": len(refined)}
 

@@ -16,14 +16,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError, PointSplatError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import write_tensors
 from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.frames import Frames
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, RenderedDataset
 from pointsplat_ns.pruning import PruneSettings
-from pointsplat_ns.rasterizer import render, render_with_alpha
-from pointsplat_ns.refiner.scene_cut import SceneCut, cut_scene
+from pointsplat_ns.refinement.scene_cut import SceneCut, cut_scene
+from pointsplat_ns.rendering import render, render_with_alpha
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.system.files import write_tensors
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
@@ -241,8 +241,8 @@ def count_of(scene: DenseScene) -> int | None:
 def cut_scenes(
     scenes: Sequence[DenseScene], most: int, config: ScenesDataManagerConfig
 ) -> list[ScenePiece]:
-    """The pieces of readable scenes, of at most ``most`` Gaussians, in all cuts of the datamanager's
-    configuration. Each further cut has pieces of two thirds of the size."""
+    """The pieces of readable scenes, of at most ``most`` Gaussians, in all cuts of the
+    datamanager's configuration. Each further cut has pieces of two thirds of the size."""
     found: list[ScenePiece] = []
     for scene in scenes:
         dense = scene.dense(keep=True)

@@ -16,12 +16,10 @@ from nerfstudio.engine.callbacks import (
     TrainingCallbackLocation,
 )
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 
-from pointsplat_ns.compression.trained_refiner import network_options
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.metrics.lpips import ReportedLpips
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.pointsplat import evaluation
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import (
     ScenesDataManager,
@@ -29,7 +27,9 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import (
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import evaluate_scene, only_finite
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
-from pointsplat_ns.refiner import save_refiner
+from pointsplat_ns.pipeline.trained_refiner import network_options
+from pointsplat_ns.refinement import save_refiner
+from pointsplat_ns.scene.runs import RUN_FILES
 from pointsplat_ns.system import processes
 
 MODEL_METADATA = (
@@ -122,7 +122,7 @@ class PointSplatPipeline(VanillaPipeline):
         self.trained_on |= set(state["trained_on"])
         gone = set(state["trained_on"]) - {scene.identity for scene in self.datamanager.scenes}
         if gone:
-            CONSOLE.log(
+            log(
                 f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} "
                 "no longer has"
             )

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 
-from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import (
     REFINER_RATES,
     PointSplatTrainerConfig,
@@ -20,6 +19,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.config import (
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModelConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
+from pointsplat_ns.scene.runs import METHOD_NAMES
 
 
 def paper_config() -> PointSplatTrainerConfig:

@@ -13,22 +13,23 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimize
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.utils.colors import get_color
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import one_line
-from pointsplat_ns.io.inert_yaml import Tagged
-from pointsplat_ns.io.runs import RUN_FILES, Run
-from pointsplat_ns.io.splatfacto import read_checkpoint, read_photo_fit
-from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND, views_of_cameras
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache, UndistortedDataset
+from pointsplat_ns.nerfstudio_plugin.image_guard import photos_alone
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, Split
-from pointsplat_ns.photos.examples import Example
+from pointsplat_ns.pipeline.photos.examples import Example
+from pointsplat_ns.scene.checkpoints import read_checkpoint, read_photo_fit
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.inert_yaml import Tagged
+from pointsplat_ns.scene.runs import RUN_FILES, Run
+from pointsplat_ns.scene.usable import keep_usable
+from pointsplat_ns.scene.views import View, Views
+from pointsplat_ns.system.files import one_line
 from pointsplat_ns.system.tensors import FLOATS
-from pointsplat_ns.views import View, Views
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
@@ -57,7 +58,7 @@ def dataparser_of(run: Run) -> DataParser:
         if name not in fields and value is not None
     ]
     if unknown:
-        CONSOLE.log(
+        log(
             f"{run.config_path}: settings that its dataparser no longer has are left out: "
             f"{', '.join(unknown)}"
         )
@@ -160,7 +161,8 @@ class TrainedScene(DenseScene):
         """The dataparser's outputs for a split. Raises DataError if the data is damaged, or its
         coordinate frame is not that of the Gaussians."""
         try:
-            outputs = self._dataparser.get_dataparser_outputs(split=split)
+            with photos_alone():
+                outputs = self._dataparser.get_dataparser_outputs(split=split)
         except PointSplatError:
             raise
         except (

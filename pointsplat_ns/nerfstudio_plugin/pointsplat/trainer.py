@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import writer
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch.nn.utils import clip_grad_norm_
 from torch.optim.lr_scheduler import LambdaLR
 
-from pointsplat_ns.compression.repair import rate_factor
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainer
+from pointsplat_ns.refinement.schedules import cosine_factor
 from pointsplat_ns.system import processes
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def rate_factor_at(
     last = 0.02
     if share < warm_up:
         return share / warm_up
-    return rate_factor(min(1.0, (share - warm_up) / (1 - warm_up)), last)
+    return cosine_factor(min(1.0, (share - warm_up) / (1 - warm_up)), last)
 
 
 class PointSplatTrainer(StoppableTrainer):
@@ -100,7 +100,7 @@ class PointSplatTrainer(StoppableTrainer):
             if share >= 1:
                 self.stop_training = True
                 self._last_step = step
-                CONSOLE.log(f"the time is over: {step + 1} steps in {pipeline.seconds:.0f} s")
+                log(f"the time is over: {step + 1} steps in {pipeline.seconds:.0f} s")
         super().update(step, skipped)
 
     def clip(self) -> None:

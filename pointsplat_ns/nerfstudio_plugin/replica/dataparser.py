@@ -15,10 +15,10 @@ from nerfstudio.data.dataparsers.base_dataparser import (
     DataparserOutputs,
 )
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import flip_camera_axes
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.replica.layout import (
     ReplicaScene,
     load_replica,
@@ -99,7 +99,7 @@ class ReplicaDataParser(DataParser):
                     "points3D_rgb": torch.from_numpy(rgb),
                 }
             else:
-                CONSOLE.log(
+                log(
                     f"{scene.folder}: photos without depth images, or no known pixel in these: no "
                     "seed points"
                 )

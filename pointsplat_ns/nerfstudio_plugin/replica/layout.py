@@ -14,16 +14,17 @@ it.
 
 import json
 import re
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import logger, one_line, read_text
-from pointsplat_ns.io.pictures import exif_hint
+from pointsplat_ns.scene.image_files import IMAGE_ERRORS, exif_hint, open_image
+from pointsplat_ns.system.files import logger, one_line, read_text
 
 FARTHEST = 1e18
 """Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot
@@ -153,7 +154,8 @@ def _params(folder: Path, names: Layout, photo: Path) -> PinholeParams:
     )
     path = next((place for place in places if place.is_file()), None)
     if path is None and names is SEMANTIC_NERF:
-        width, height = _opened(photo).size
+        with _opened(photo) as image:
+            width, height = image.size
         return PinholeParams(
             width, height, width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, 1000.0, photo
         )
@@ -202,43 +204,55 @@ def read_trajectory(path: Path) -> np.ndarray:
 def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
     """One photo, uint8 (H, W, 3), sRGB. Raises DataError if it is missing, broken or of another
     size than ``params``."""
-    return np.asarray(_decoded(path, params).convert("RGB"))
+    with _decoded(path, params) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
     """One depth image, float32 (H, W), scene units along the optical axis, 0 where unknown. Raises
     DataError if it is missing or broken, not of 16 bits, or of another size than ``params``."""
-    image = _decoded(path, params)
-    if image.mode not in ("I;16", "I;16B", "I"):
-        raise DataError(f"{path}: pixels of mode {image.mode}; expected a 16-bit grey depth image")
-    raw = np.asarray(image).astype(np.int64)
+    with _decoded(path, params) as image:
+        if image.mode not in ("I;16", "I;16B", "I"):
+            raise DataError(
+                f"{path}: pixels of mode {image.mode}; expected a 16-bit grey depth image"
+            )
+        raw = np.asarray(image).astype(np.int64)
     depth = raw.astype(np.float32) / np.float32(params.scale)
     depth[np.isin(raw, (0, 65535))] = 0.0  # empty and saturated: not measured
     return depth
 
 
-def _opened(path: Path) -> Any:
-    try:
-        return Image.open(path)
-    except OSError as error:
-        raise DataError(
-            f"{path}: not a readable picture ({type(error).__name__}); restore the file"
-        ) from None
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The image of a file, whose pixels are not decoded. Raises DataError if it cannot be read."""
+    with ExitStack() as stack:
+        try:
+            image = stack.enter_context(open_image(path))
+        except IMAGE_ERRORS as error:
+            raise DataError(
+                f"{path}: not a readable picture ({one_line(error)}); restore the file"
+            ) from None
+        yield image
 
 
-def _decoded(path: Path, params: PinholeParams) -> Any:
-    image = _opened(path)
-    wanted = (params.width, params.height)
-    if image.size != wanted:
-        raise DataError(
-            f"{path}: {image.width} x {image.height} pixels; expected {wanted[0]} x {wanted[1]} "
-            f"as in {params.path}" + exif_hint(path, wanted)
-        )
-    try:
-        image.load()
-    except (OSError, SyntaxError, ValueError) as error:
-        raise DataError(f"{path}: broken picture ({error}); restore the file") from None
-    return image
+@contextmanager
+def _decoded(path: Path, params: PinholeParams) -> Iterator[Any]:
+    """The same with its pixels. Raises DataError, too, if it is broken or of another size than
+    ``params``."""
+    with _opened(path) as image:
+        wanted = (params.width, params.height)
+        if image.size != wanted:
+            raise DataError(
+                f"{path}: {image.width} x {image.height} pixels; expected {wanted[0]} x {wanted[1]}"
+                f" as in {params.path}" + exif_hint(path, wanted)
+            )
+        try:
+            image.load()
+        except IMAGE_ERRORS as error:
+            raise DataError(
+                f"{path}: broken picture ({one_line(error)}); restore the file"
+            ) from None
+        yield image
 
 
 def _numbered(folder: Path, pattern: str) -> dict[int, Path]:

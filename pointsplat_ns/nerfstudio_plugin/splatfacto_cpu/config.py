@@ -15,7 +15,6 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
@@ -24,6 +23,7 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import (
     SplatfactoCpuTrainer,
 )
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
+from pointsplat_ns.scene.gaussians import PARAMETERS
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""
@@ -62,12 +62,13 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
     scene grow to fewer Gaussians. Options set by hand are not changed."""
 
     def setup(self, **kwargs) -> Trainer:
-        """Build the trainer with a copy of this config whose rates and limits of gradients are set.
+        """Build the trainer with a copy of this config whose schedules are fitted to the length.
 
         A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes
-        from, or when ``seconds`` are over, as if it had not been stopped.
+        from, as if it had not been stopped.
         """
-        return self._target(fitted_schedules(self) if self.scale_schedules else self, **kwargs)
+        fitted = fitted_schedules(self) if self.scale_schedules else copy.deepcopy(self)
+        return self.trainer(fitted, **kwargs)
 
 
 def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainerConfig:

@@ -28,7 +28,6 @@ from nerfstudio.models.splatfacto import (
     random_quat_tensor,
 )
 from nerfstudio.utils.colors import get_color
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
@@ -41,7 +40,8 @@ from pointsplat_ns.nerfstudio_plugin.cameras import (
     RasterizerOptions,
     need_pinhole,
 )
-from pointsplat_ns.rasterizer.rendering import Colors
+from pointsplat_ns.nerfstudio_plugin.console import log
+from pointsplat_ns.rendering.rasterization import Colors
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 
@@ -298,14 +298,12 @@ def finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] |
         finite &= colors.isfinite().all(dim=1)
         colors = colors[finite]
     if not finite.all():
-        CONSOLE.log(
-            f"{int((~finite).sum())} of {len(points)} seed points are not finite and were dropped"
-        )
+        log(f"{int((~finite).sum())} of {len(points)} seed points are not finite and were dropped")
     if not finite.any():
-        CONSOLE.log("no seed points are left; a training starts from random ones")
+        log("no seed points are left; a training starts from random ones")
         return None
     if len(colors) > 0 and not colors.any():
-        CONSOLE.log(
+        log(
             "all seed points are black, as where colours are unknown; a training starts from "
             "random colours"
         )

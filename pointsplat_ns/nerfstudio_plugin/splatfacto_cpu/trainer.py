@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
-from pointsplat_ns.errors import DataError
+from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric
-from pointsplat_ns.nerfstudio_plugin.trainer import STATE, StoppableTrainer
+from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainer
 from pointsplat_ns.system.tensors import FLOATS
 
 if TYPE_CHECKING:
@@ -40,6 +40,24 @@ class SplatfactoCpuPipeline(VanillaPipeline):
     NaN."""
 
     datamanager: LazyImageDatamanager
+
+    def __init__(self, config: SplatfactoCpuPipelineConfig, *args: Any, **kwargs: Any):
+        super().__init__(config, *args, **kwargs)
+        cameras = self.datamanager.train_dataset.cameras
+        side = int(torch.cat([cameras.width, cameras.height]).min())
+        if side < 1:
+            raise DataError(
+                f"{self.datamanager.get_datapath()}: photos of {side} pixels once they are scaled; "
+                "expected at least 1: change --downscale-factor or "
+                "--pipeline.datamanager.camera-res-scale-factor"
+            )
+        most = side.bit_length() - 1
+        downscales: int = getattr(config.model, "num_downscales", 0)
+        if downscales > most:
+            raise PointSplatError(
+                f"--pipeline.model.num-downscales {downscales}: the shortest side of the photos is "
+                f"{side} pixels, and nothing would be left of it; expected {most} at most"
+            )
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -104,19 +122,8 @@ class SplatfactoCpuTrainer(StoppableTrainer):
             state["frames"] = manager.random_generator.getstate()
         return state
 
-    def _load_checkpoint(self) -> None:
-        """As nerfstudio's; then put back :meth:`state_to_resume`. Of another number of photos,
-        their order is left alone."""
-        super()._load_checkpoint()
-        folder = self.config.load_dir
-        path = self.config.load_checkpoint
-        if folder is not None:
-            path = folder / f"step-{self._start_step - 1:09d}.ckpt"
-        state = (
-            None
-            if path is None
-            else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
-        )
+    def put_back(self, state: Any) -> None:
+        """See the base class. Of another number of photos, their order is left alone."""
         if state is None:  # those of nerfstudio's own methods have none
             return
         torch.set_rng_state(state["torch"])

@@ -11,10 +11,10 @@ from lab.tables import layout
 from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
 from making import box_room
-from pointsplat_ns import view_source
-from pointsplat_ns.compression import repair
-from pointsplat_ns.refiner import Refiner, preset
-from pointsplat_ns.refiner.weights import save_refiner
+from pointsplat_ns.pipeline import repair_budget, view_provider
+from pointsplat_ns.refinement import Refiner, preset
+from pointsplat_ns.refinement.weights import save_refiner
+from quick import quick_settings
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +36,8 @@ def weights(tmp_path_factory) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def views_of_room() -> ps.Views:
-    return ps.sample_views(box_room(0, 400), 3, 48, 36)
+    with quick_settings():
+        return ps.sample_views(box_room(0, 400), 3, 48, 36)
 
 
 @pytest.fixture()
@@ -44,12 +45,12 @@ def room(tmp_path, views_of_room, no_lpips, monkeypatch) -> Path:
     """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps,
     figures are none."""
     monkeypatch.setattr(
-        view_source.Sampler, "views", lambda sampler, count, *_, **options: views_of_room[:count]
+        view_provider.Sampler, "views", lambda sampler, count, *_, **options: views_of_room[:count]
     )
     monkeypatch.setattr(
         layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure")
     )
-    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    monkeypatch.setitem(repair_budget.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"
 

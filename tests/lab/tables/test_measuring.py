@@ -12,8 +12,10 @@ from lab.tables.measure import Judge
 from lab.tables.ways import WAYS, Ways
 from making import box_room
 from peers import peer
-from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.rendering.comparison.closeness import DenseReference
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def cells_of(tables) -> dict:

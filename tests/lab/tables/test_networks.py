@@ -12,8 +12,10 @@ from lab.tables.networks import jobs
 from lab.tables.ways import WAYS
 from making import box_room, write_run
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.refiner import Refiner, preset
-from pointsplat_ns.refiner.weights import save_refiner
+from pointsplat_ns.refinement import Refiner, preset
+from pointsplat_ns.refinement.weights import save_refiner
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 NUMBER = {job.name: f"{number}/16" for number, job in enumerate(jobs(), 1)}
 """Shards of one network each."""

@@ -7,7 +7,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import box_room, fast_config, views_sampled_once
-from pointsplat_ns.io import write_ply
+from pointsplat_ns.scene.ply import write_ply
+from quick import quick_settings
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -22,12 +23,14 @@ def trained(trained_walls, run_training, tmp_path_factory):
     config = fast_config(trained_walls, tmp_path_factory.mktemp("refined"))
     config.pipeline.datamanager.eval_scenes = ("wall-b",)
     config.steps_per_eval_image = 4
-    return config, run_training(config)[0]
+    with quick_settings():
+        return config, run_training(config)[0]
 
 
 @pytest.fixture(scope="session")
 def evaluated(trained):
-    return eval_setup(trained[0].get_base_dir() / "config.yml")[1]
+    with quick_settings():
+        return eval_setup(trained[0].get_base_dir() / "config.yml")[1]
 
 
 @pytest.fixture(scope="session")

@@ -26,11 +26,10 @@ from making import (
     views_sampled_once,
 )
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
-from quick_looking import QUICK
+from pointsplat_ns.scene.ply import write_ply
+from quick import quick_settings
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
@@ -229,7 +228,7 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
 
 if __name__ == "__main__":
     child = os.fork()  # nothing has been computed, so there are no threads yet
-    with changed(QUICK), views_sampled_once():
+    with quick_settings(), views_sampled_once():
         work(0 if child else 1, Path(sys.argv[1]), sys.argv[2])
     if child:
         sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))

@@ -19,14 +19,16 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch loa
 from making import SHARED_DATA, pipeline_of, same, small_config
 from pointsplat_ns.cli.export import export
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import PARAMETERS
-from pointsplat_ns.io import read_ply
-from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.metrics import PIXEL_LOSSES
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import VARIANTS, print_summary
 from pointsplat_ns.pruning import METHODS, score_of, select
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rendering import rasterization
+from pointsplat_ns.scene.gaussians import PARAMETERS
+from pointsplat_ns.scene.ply import read_ply
+from pointsplat_ns.scene.runs import open_run
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def test_untrained_the_refined_scene_is_the_pruned_one_to_the_bit(trained_walls):
@@ -99,7 +101,7 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
     ("changes", "message"),
     [
         ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or above"),
-        ({"by": "pup"}, "pup looks at a scene from poses; expected a method that needs none"),
+        ({"by": "pup"}, "pup needs views of the scene; expected a method that needs none"),
         (
             {"encoder": "concat", "use_position": False},
             "switches of the encoder 'dual'; encoder 'concat' expects both",
@@ -116,7 +118,7 @@ def test_contradictory_settings_are_refused(trained_walls, tmp_path, changes, me
     config = small_config(trained_walls, tmp_path / "outputs", 1)
     for name, value in changes.items():
         setattr(config if hasattr(config, name) else config.pipeline.model, name, value)
-    config.save_config()
+    config.write_config()
     with pytest.raises(PointSplatError, match=message):
         config.setup(local_rank=0, world_size=1).setup()
 
@@ -178,51 +180,80 @@ def test_the_printed_table_has_each_scene_and_mean(report, capsys):
         assert row[6:8] == [f"{dense['gaussians']:,.0f}", f"{dense['megabytes']:.2f}"]
 
 
-def test_a_report_has_sizes_quality_and_speed_of_each_scene(evaluated, report):
-    found, folder = report
-    for index, (name, seen) in enumerate((("wall-a", True), ("wall-b", False))):
-        scene = evaluated.model.pruned_scene(index)
-        block = found["scenes"][name]
-        assert (block["views"], block["seen_in_training"]) == (2, seen)
-        assert block["dense"]["gaussians"] == len(evaluated.datamanager.scenes[index].read_dense())
-        assert block["pruned"]["gaussians"] == block["refined"]["gaussians"] == len(scene.pruned)
-        assert block["pruned"]["megabytes"] == pytest.approx(scene.pruned.megabytes)
-        assert all(block[v]["fps"] > 0 and 0 < block[v]["ssim"] <= 1 for v in VARIANTS)
-        assert block["dense"]["psnr"] > block["pruned"]["psnr"], (
-            "half the Gaussians of a wall leave holes"
-        )
-        values = [block[variant]["lpips"] for variant in VARIANTS]
-        if LPIPS_WEIGHTS.exists():
-            assert all(0 < value < 2 for value in values) and "lpips_note" not in found
-        else:
-            assert values == [None] * 3 and found["lpips_note"] == "no weights here"
+SCENES = pytest.mark.parametrize(("index", "name"), [(0, "wall-a"), (1, "wall-b")])
+
+
+@SCENES
+def test_a_report_has_the_counts_and_sizes_of_each_scene(evaluated, report, index, name):
+    block = report[0]["scenes"][name]
+    pruned = evaluated.model.pruned_scene(index).pruned
+    assert block["dense"]["gaussians"] == len(evaluated.datamanager.scenes[index].read_dense())
+    assert block["pruned"]["gaussians"] == block["refined"]["gaussians"] == len(pruned)
+    assert block["pruned"]["megabytes"] == pytest.approx(pruned.megabytes)
+
+
+@SCENES
+def test_a_report_says_which_scenes_were_seen_in_training(report, index, name):
+    block = report[0]["scenes"][name]
+    assert (block["views"], block["seen_in_training"]) == (2, index == 0)
+
+
+@SCENES
+def test_a_report_has_the_quality_and_speed_of_each_scene(report, index, name):
+    block = report[0]["scenes"][name]
+    assert all(block[variant]["fps"] > 0 for variant in VARIANTS)
+    assert all(0 < block[variant]["ssim"] <= 1 for variant in VARIANTS)
+    # half the Gaussians of a wall leave holes
+    assert block["dense"]["psnr"] > block["pruned"]["psnr"]
+
+
+@SCENES
+def test_a_report_has_lpips_or_why_not(report, index, name):
+    values = [report[0]["scenes"][name][variant]["lpips"] for variant in VARIANTS]
+    if LPIPS_WEIGHTS.exists():
+        assert all(0 < value < 2 for value in values) and "lpips_note" not in report[0]
+    else:
+        assert values == [None] * 3 and report[0]["lpips_note"] == "no weights here"
+
+
+def test_means_of_a_report_are_over_all_scenes_and_over_those_seen_and_unseen(report):
+    found, _ = report
     seen, unseen = (found["scenes"][name]["refined"]["psnr"] for name in ("wall-a", "wall-b"))
-    means = {
-        key: found[key]["refined"]["psnr"] for key in ("average", "average_seen", "average_unseen")
-    }
-    assert means == {
-        "average": pytest.approx((seen + unseen) / 2),
-        "average_seen": seen,
-        "average_unseen": unseen,
-    }
-    assert found["psnr"] == unseen and found["psnr_std"] > 0
-    network = {
+    assert found["average"]["refined"]["psnr"] == pytest.approx((seen + unseen) / 2)
+    assert found["average_seen"]["refined"]["psnr"] == seen
+    assert found["average_unseen"]["refined"]["psnr"] == found["psnr"] == unseen
+    assert found["psnr_std"] > 0
+
+
+def test_a_report_has_the_settings_of_the_network_and_of_pruning(report):
+    assert report[0]["settings"] == {
         "size": "tiny",
         "encoder": "dual",
         "use_appearance": True,
         "use_position": True,
         "norm": "scene",
+        "stem": "conv",
+        "raw_inputs": False,
+        "means_reach": 0.05,
+        "keep": 0.5,
+        "by": "paper",
+        "opacity_weight": None,
     }
-    network |= {"stem": "conv", "raw_inputs": False, "means_reach": 0.05}
-    assert found["settings"] == {**network, "keep": 0.5, "by": "paper", "opacity_weight": None}
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert not evaluated.training and not evaluated.model.training, "the model is left as it was"
-    assert sorted(path.name for path in folder.iterdir()) == [
-        f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)
-    ]
-    assert cv2.imread(str(folder / "wall-a_0000.png")).shape == (48, 4 * 64, 3), (
-        "photo, dense, pruned, refined"
-    )
+
+
+def test_a_report_is_json_without_infinities(report):
+    assert json.loads(json.dumps(report[0], allow_nan=False)) == report[0]
+
+
+def test_an_evaluation_leaves_the_model_as_it_was(evaluated, report):
+    assert not evaluated.training and not evaluated.model.training
+
+
+def test_pictures_of_a_report_show_photo_dense_pruned_and_refined(report):
+    _, folder = report
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == [f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)]
+    assert cv2.imread(str(folder / names[0])).shape == (48, 4 * 64, 3)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0])

@@ -7,15 +7,15 @@ import torch
 
 from making import box_room, dense_config, equal, small_config, small_refiner
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.pointsplat import pieces
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import ScenePiece, read_piece
 from pointsplat_ns.pruning import PruneSettings
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.refiner import WeightsError, read_refiner, save_refiner
+from pointsplat_ns.refinement import WeightsError, read_refiner, save_refiner
+from pointsplat_ns.rendering import render
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.scene.runs import RUN_FILES
 
 
 @pytest.fixture(autouse=True)

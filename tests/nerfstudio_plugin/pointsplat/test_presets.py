@@ -11,11 +11,13 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import equal, small_config
-from pointsplat_ns.compression.trained_refiner import load_refiner
-from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
-from pointsplat_ns.refiner import Refiner
-from pointsplat_ns.refiner.weights import read_metadata
+from pointsplat_ns.pipeline.trained_refiner import load_refiner
+from pointsplat_ns.refinement import Refiner
+from pointsplat_ns.refinement.weights import read_metadata
+from pointsplat_ns.scene.runs import RUN_FILES
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 PRESETS = {"paper": paper_config, "authors": authors_config}
 

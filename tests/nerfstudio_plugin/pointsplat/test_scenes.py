@@ -13,17 +13,19 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 from making import box_room
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.io import write_ply
-from pointsplat_ns.io.runs import open_run
-from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.cameras import carried
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, dataparser_of
-from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import EPS2D, Views
+from pointsplat_ns.rendering import render
+from pointsplat_ns.scene.ply import write_ply
+from pointsplat_ns.scene.runs import open_run
+from pointsplat_ns.scene.views import EPS2D, Views
+from pointsplat_ns.view_sampling.sampler import sample_views
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def manager_of(folder: Path, **settings):
@@ -36,7 +38,7 @@ def manager_of(folder: Path, **settings):
 def run(tmp_path, wall_config, wall_scene) -> Path:
     """A run folder as nerfstudio lays it out, with an empty checkpoint."""
     config = wall_config(wall_scene, tmp_path, steps=1)
-    config.save_config()
+    config.write_config()
     config.get_checkpoint_dir().mkdir()
     torch.save({"step": 0, "pipeline": {}}, config.get_checkpoint_dir() / "step-000000000.ckpt")
     return config.get_base_dir()
@@ -75,7 +77,7 @@ def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(run):
         "what was not given need not exist any more"
     )
     config.write_text(text.replace("frame_stride:", "frame_leap:"))
-    with mock.patch("pointsplat_ns.nerfstudio_plugin.pointsplat.scenes.CONSOLE.log") as log:
+    with mock.patch("pointsplat_ns.nerfstudio_plugin.console.CONSOLE.log") as log:
         assert dataparser_of(open_run(run)).config.frame_stride == 1
     assert log.call_args.args[0].endswith(
         "settings that its dataparser no longer has are left out: frame_leap"
@@ -130,6 +132,30 @@ def test_a_step_depends_on_its_number_alone_and_processes_share_it(trained_walls
         ]
         together = [photos_of(share, step) for step in range(12 // size) for share in shares]
         assert together == alone
+
+
+def test_steps_of_one_scene_draw_different_photos(trained_walls):
+    manager = manager_of(trained_walls)
+    steps = [photos_of(manager, step) for step in range(24)]
+    for scene in manager.train_indices:
+        drawn = [tuple(photos) for found, photos in steps if found == scene]
+        assert len(drawn) == 12
+        assert len(set(drawn)) > 6  # of 12 draws of 2 of 10 photos, about 11 differ
+
+
+def test_epochs_have_the_scenes_in_different_orders(trained_walls):
+    manager = manager_of(trained_walls)
+    orders = {tuple(manager.scene_at(2 * epoch + i) for i in range(2)) for epoch in range(16)}
+    assert orders == {(0, 1), (1, 0)}
+
+
+def test_evaluations_show_different_photos(trained_walls, monkeypatch):
+    manager = manager_of(trained_walls)
+    frames = [*range(7)]
+    for scene in manager.scenes:
+        monkeypatch.setattr(scene, "frames", lambda split: frames)
+    shown = {manager.next_eval_image(step)[1][0] for step in range(0, 24, 2)}
+    assert len(shown) > 3
 
 
 POSES = ScenesDataManagerConfig(sampled_poses=6, sampled_size=(32, 24), seed=1)

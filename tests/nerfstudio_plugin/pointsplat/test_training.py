@@ -13,11 +13,13 @@ from nerfstudio.utils.eval_utils import eval_setup
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from broken_steps import broken
 from making import dense_config, equal, move_zero_layers, small_config
-from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import MODEL_METADATA
-from pointsplat_ns.refiner import read_refiner
-from pointsplat_ns.refiner.weights import read_metadata
+from pointsplat_ns.refinement import read_refiner
+from pointsplat_ns.refinement.weights import read_metadata
+from pointsplat_ns.scene.runs import RUN_FILES
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
@@ -71,7 +73,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(three_rooms, t
     history = []
     with (
         broken("nan", {1}),
-        mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log,
+        mock.patch("pointsplat_ns.nerfstudio_plugin.console.CONSOLE.log") as log,
     ):
         trainer.setup()
         for step in range(3):
@@ -193,6 +195,25 @@ def test_one_network_learns_at_several_budgets_and_shows_the_first(trained_walls
             cache.get(("pruned", s.name, model.config.prune_settings(keep))) for s in model.scenes
         )
     assert len(model.eval().refine(0)) == round(0.5 * len(model.scenes[0].read_dense()))
+
+
+def test_steps_draw_different_random_numbers_and_a_step_always_the_same(trained_walls, tmp_path):
+    """What augmentation, backgrounds and budgets are drawn from."""
+    pipeline = small_config(trained_walls, tmp_path, 3).pipeline.setup(
+        device="cpu", test_mode="val"
+    )
+    pipeline.train()
+    drawn = {}
+
+    def losses(index, frames):
+        drawn.setdefault(step, []).append(float(torch.rand(())))
+        return {}, {}, {}
+
+    pipeline.model.losses = losses
+    for step in (0, 1, 2, 3, 2, 0):
+        pipeline.get_train_loss_dict(step)
+    assert len({values[0] for values in drawn.values()}) == 4
+    assert all(len(set(values)) == 1 for values in drawn.values())
 
 
 def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls, tmp_path):

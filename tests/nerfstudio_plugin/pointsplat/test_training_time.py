@@ -13,6 +13,8 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer, rate_factor_at
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 
 @pytest.fixture(autouse=True)
 def steps_of_ten_seconds(monkeypatch):

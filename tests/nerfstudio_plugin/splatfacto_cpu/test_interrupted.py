@@ -15,13 +15,14 @@ from nerfstudio.scripts.train import launch
 from broken_steps import broken
 from making import equal, small_config
 from pointsplat_ns.errors import DataError, PointSplatError
-from pointsplat_ns.io import open_run, read_scene
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import (
     SplatfactoCpuTrainer,
     splatfacto_cpu_config,
 )
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import takes_tiny_as_zero
+from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.scene.runs import open_run
 
 
 @pytest.fixture(autouse=True)
@@ -112,7 +113,7 @@ def test_no_steps_are_refused_and_leave_no_folder(number, wall_scene, wall_confi
         with pytest.raises(
             PointSplatError, match=f"--max-num-iterations {number}: expected at least 1"
         ):
-            config.save_config()
+            config.set_timestamp()
         assert not config.output_dir.exists()
 
 
@@ -164,7 +165,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_named(started, kind, s
     assert before["gathered"]["count"].any(), "densification has gathered something"
     with (
         broken(kind, range(2, 3)),
-        mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log,
+        mock.patch("pointsplat_ns.nerfstudio_plugin.console.CONSOLE.log") as log,
     ):
         (metrics,) = take(started, [2])
     assert equal(state_of(started), before)

@@ -22,7 +22,7 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import (
 )
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
 from pointsplat_ns.nerfstudio_plugin.trainer import STATE
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rendering import rasterization
 
 SEED = 20
 

@@ -1,1 +1,0 @@
-"""Renders of scenes beside those of the dense scene."""

@@ -1,0 +1,1 @@
+"""Compares renders of scenes with renders of the dense scene."""

@@ -1,0 +1,1 @@
+"""Scenes and their files: Gaussians, views, trained runs, PLY and other formats."""

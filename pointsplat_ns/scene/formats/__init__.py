@@ -1,0 +1,255 @@
+"""Scene file formats: the table of all formats, and a module for each except plain PLY.
+
+One table identifies every file. The first bytes, or for a zip archive the names of its files,
+decide the format, whatever the file is called. Only ``.splat`` has no magic number and is
+identified by name. Readers check counts and sizes against the file size before they allocate
+memory, and limit decompression.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.scene.checkpoints import read_checkpoint
+from pointsplat_ns.scene.formats import sog, splat, spz
+from pointsplat_ns.scene.formats.capacity import Holds
+from pointsplat_ns.scene.formats.compressed_ply import is_compressed, read_compressed_ply
+from pointsplat_ns.scene.formats.sog import encode_sog, read_sog, rounded_for_sog
+from pointsplat_ns.scene.formats.sog_images import SOG_META
+from pointsplat_ns.scene.formats.sog_stream import STREAM_META, read_sog_stream
+from pointsplat_ns.scene.formats.splat import encode_splat, read_splat
+from pointsplat_ns.scene.formats.spz import encode_spz, read_spz, rounded_for_spz
+from pointsplat_ns.scene.gaussians import Gaussians, Traits
+from pointsplat_ns.scene.ply import ply_bytes, read_ply, write_ply
+from pointsplat_ns.scene.ply_header import read_header
+from pointsplat_ns.system.files import failure_named, one_line, replacing
+from pointsplat_ns.system.progress import Progress
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of scene file."""
+
+    name: str
+    suffix: str
+    """Suffix of its file names, lower case, or a whole name; empty for a format that is identified
+    only by content."""
+    read: Callable[[Path], Gaussians] | None = None
+    write: Callable[[Gaussians, Path, Progress], None] | None = None
+    starts: tuple[bytes, ...] = ()
+    """Magic numbers at the start of its files, if they identify it."""
+    holds: str = ""
+    """Pattern of a file name, without folders, in its zip archives, if that identifies it."""
+    instead: str = ""
+    """Advice to the user, for a format that is not read."""
+    bytes_of: Callable[[int, int, Traits], int] | None = None
+    """Exact file size, bytes, from the number of Gaussians, their SH degree and the scene's traits;
+    None if it depends on more."""
+    encode: Callable[[Gaussians, Progress], bytes] | None = None
+    """Encodes a scene, where only the encoded bytes give the file size."""
+    rounded: Callable[[Gaussians, float], Gaussians] | None = None
+    """Rounds a scene's numbers to make its file smaller, by a tolerance (see :mod:`rounding`)."""
+    capacity: Holds = Holds()
+    """Range and step of each attribute in its files."""
+
+
+def _writer(
+    encode: Callable[[Gaussians, Progress], bytes],
+) -> Callable[[Gaussians, Path, Progress], None]:
+    """A function that encodes a scene and writes it to a file atomically."""
+
+    def write(scene: Gaussians, path: Path, progress: Progress) -> None:
+        data = encode(scene, progress)
+        with replacing(path, len(data)) as part:
+            part.write_bytes(data)
+
+    return write
+
+
+_PLY = (b"ply\n", b"ply\r")
+_CONVERT = (
+    "convert it to .ply or .sog with splat-transform, or open it in SuperSplat and export the scene"
+)
+_EXPORT = "export the scene as .ply, .sog or .spz from the program that made it"
+
+FORMATS = (
+    # Longer suffixes come before the suffixes that they end with, and names that occur in several
+    # formats after names that occur in one.
+    Format("compressed PLY", ".compressed.ply", read_compressed_ply, starts=_PLY),
+    Format(
+        "3DGS PLY",
+        ".ply",
+        read_ply,
+        lambda scene, path, _: write_ply(scene, path),
+        _PLY,
+        bytes_of=ply_bytes,
+        capacity=Holds(offset=True),
+    ),
+    Format(
+        "SPZ",
+        ".spz",
+        read_spz,
+        _writer(encode_spz),
+        (b"\x1f\x8b\x08", b"NGSP"),
+        encode=encode_spz,
+        rounded=rounded_for_spz,
+        capacity=spz.HOLDS,
+    ),
+    Format(
+        "SuperSplat project",
+        ".ssproj",
+        holds="document.json",
+        instead="open it in SuperSplat and export the scene as .ply, .sog or .spz",
+    ),
+    Format("zip of a streamed SOG", "", holds=STREAM_META, instead="unpack it and name its folder"),
+    Format(
+        "SOG",
+        ".sog",
+        read_sog,
+        _writer(encode_sog),
+        holds=SOG_META,
+        encode=encode_sog,
+        rounded=rounded_for_sog,
+        capacity=sog.HOLDS,
+    ),
+    Format(
+        "checkpoint",
+        ".ckpt",
+        read_checkpoint,
+        starts=(b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P",),
+        holds="data.pkl",
+    ),
+    Format("streamed SOG", STREAM_META, read_sog_stream, capacity=sog.HOLDS),
+    Format("SOG folder", SOG_META, read_sog),
+    Format(
+        "splat",
+        ".splat",
+        read_splat,
+        _writer(encode_splat),
+        bytes_of=lambda count, *_: 32 * count,
+        capacity=splat.HOLDS,
+    ),
+    Format("zip of a PLY", "", holds="*.ply", instead="unpack it and name the PLY"),
+    Format("ksplat", ".ksplat", instead=_CONVERT),
+    Format("LCC", ".lcc", instead=_CONVERT),
+    Format("LCC", ".lcc2", instead=_CONVERT),
+    Format("Postshot project", ".psht", instead=_EXPORT),
+    Format("RAD", ".rad", instead=_EXPORT, capacity=Holds(antialiased=False)),
+    Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), holds="*.usd[ac]", instead=_EXPORT),
+    Format("glTF", ".glb", starts=(b"glTF",), instead=_EXPORT),
+    Format("LAS point cloud", ".las", starts=(b"LASF",), instead="it holds points, no Gaussians"),
+    Format(
+        "E57 point cloud", ".e57", starts=(b"ASTM-E57",), instead="it holds points, no Gaussians"
+    ),
+    Format(
+        "Git LFS pointer",
+        "",
+        starts=(b"version https://git-lfs",),
+        instead="fetch the file with git lfs pull",
+    ),
+    Format(
+        "web page",
+        "",
+        starts=(b"<!DOCTYPE", b"<!doctype", b"<html"),
+        instead="download the file again",
+    ),
+)
+"""All formats of files that hold only a scene, and the formats that are refused by name."""
+
+READABLE = ", ".join(
+    kind.suffix for kind in FORMATS if kind.read and kind.suffix not in ("", ".ckpt")
+)
+WRITABLE = ", ".join(kind.suffix for kind in FORMATS if kind.write)
+
+
+def format_named(name: str) -> Format | None:
+    """The format of a file name or a suffix such as ``.spz``; None if no format has it."""
+    name = Path(name).name.lower()
+    ends = (kind for kind in FORMATS if kind.suffix and name.endswith(kind.suffix))
+    return next((kind for kind in ends if kind.suffix.startswith(".") or name == kind.suffix), None)
+
+
+def format_to_read(path: Path) -> Format | None:
+    """The format of a file or SOG folder, streamed or not: by content, or else by name. None if
+    both are unknown. Raises SceneError if the file cannot be read, or its format is known but not
+    supported."""
+    if path.is_dir():
+        return next(
+            (format_named(name) for name in (STREAM_META, SOG_META) if (path / name).is_file()),
+            None,
+        )
+    with failure_named(path, "read"):
+        with path.open("rb") as stream:
+            start = stream.read(64)
+        kind = _told_by_content(path, start) or format_named(path.name)
+    if kind is not None and kind.read is None:
+        raise SceneError(f"{path}: {kind.name} files are not read; {kind.instead}")
+    return kind
+
+
+def _told_by_content(path: Path, start: bytes) -> Format | None:
+    """The format identified by a file's content, from its first bytes; None if none matches."""
+    if start.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        return _told_by_zip(path)
+    kind = next((kind for kind in FORMATS if start.startswith(kind.starts)), None)
+    if kind is not None and kind.starts == _PLY:
+        compressed, plain = FORMATS[:2]
+        with suppress(SceneError), path.open("rb") as stream:
+            return compressed if is_compressed(read_header(stream, path)) else plain
+        return plain  # its reader reports the damaged header
+    return kind
+
+
+def _told_by_zip(path: Path) -> Format | None:
+    """The format identified by the file names in a zip archive. None if the archive has no end and
+    the file has the suffix of a format that is an archive. Raises SceneError if no format
+    matches."""
+    named = format_named(path.name)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, NotImplementedError, ValueError, RuntimeError) as error:
+        if named is not None and named.holds:
+            return None
+        raise SceneError(
+            f"{path}: a truncated or damaged zip archive ({one_line(error)})"
+        ) from error
+    files = [name.rpartition("/")[2].lower() for name in names]
+    packed = next(
+        (kind for kind in FORMATS if kind.holds and fnmatch.filter(files, kind.holds)), None
+    )
+    if packed is None:
+        found = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        raise SceneError(
+            f"{path}: a zip archive of {found or 'nothing'}; expected a SOG or a checkpoint"
+        )
+    return packed
+
+
+def format_to_write(path: Path | str) -> Format:
+    """The format of an output path; a SceneError if no writable format has its suffix."""
+    path = Path(path)
+    kind = format_named(path.name)
+    if kind is None or kind.write is None:
+        what = f"a {kind.name} file" if kind else f"a {path.suffix or 'nameless'} file"
+        raise SceneError(f"{path}: cannot write {what}; expected a name that ends in {WRITABLE}")
+    return kind
+
+
+def format_like(path: Path) -> Format:
+    """The output format for a scene derived from another file: that file's format if it can be
+    written, SOG for a SOG folder and a compressed PLY, else PLY."""
+    if path.is_file() or path.is_dir():
+        with suppress(SceneError):  # its reader reports an unreadable file
+            kind = format_to_read(path)
+            if kind is not None and kind.read in (read_compressed_ply, read_sog):
+                return format_to_write(".sog")  # similar file size
+            if kind is not None and kind.write is not None:
+                return kind
+    return format_to_write(".ply")

@@ -1,0 +1,175 @@
+"""Pinhole cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal, overload
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
+
+RasterizeMode = Literal["classic", "antialiased"]
+"""Rasterize mode of a scene's training (nerfstudio's ``rasterize_mode``)."""
+
+NEAR_PLANE = 0.01
+"""Near plane of gsplat, scene units."""
+
+EPS2D = 0.3
+"""Added to the diagonal of each projected covariance, pixels^2, so that no Gaussian is thinner than
+a pixel. As in 3DGS and gsplat."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One pinhole camera with rendering settings: an element of :class:`Views`, which documents its
+    attributes.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> view = ps.sample_views(ps.example_room(), 2)[0]
+        >>> view.width, view.height, tuple(view.viewmat.shape)
+        (320, 240, (4, 4))
+    """
+
+    viewmat: Tensor  # [4, 4] world to camera, OpenCV axes, rigid
+    K: Tensor  # [3, 3] intrinsics, pixels
+    width: int
+    height: int
+    background: Tensor  # [3] in [0, 1]
+    rasterize_mode: RasterizeMode = "classic"
+    near_plane: float = NEAR_PLANE  # scene units
+    eps2d: float = EPS2D  # pixels^2
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Views:
+    """C pinhole cameras of one image size, and rendering settings.
+
+    ``views[0]`` and iteration give a :class:`View`; slices, lists of indices, index tensors and
+    boolean masks give :class:`Views`.
+
+    Attributes:
+        viewmats: (C, 4, 4) world-to-camera, OpenCV axes (x right, y down, z forward); rigid, in
+            scene units.
+        Ks: (C, 3, 3) intrinsics in pixels; the centre of the first pixel is (0.5, 0.5).
+        width: width of every image, pixels.
+        height: height of every image, pixels.
+        background: (3,) colour behind the scene, RGB in [0, 1].
+        rasterize_mode: "classic" or "antialiased", as in the scene's training.
+        near_plane: minimum depth of drawn Gaussians, scene units; default as in gsplat.
+        eps2d: added to the diagonal of each projected covariance, pixels^2; default as in 3DGS.
+
+    Raises:
+        DataError: if a shape does not match the others, or the image has no pixels.
+
+    Example:
+        >>> import torch
+        >>> import pointsplat_ns as ps
+        >>> K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
+        >>> poses = torch.eye(4).repeat(3, 1, 1)
+        >>> views = ps.Views(poses, K.repeat(3, 1, 1), 64, 48, torch.zeros(3))
+        >>> len(views), len(views[1:]), views[0].width
+        (3, 2, 64)
+    """
+
+    viewmats: Tensor  # [C, 4, 4] world to camera, OpenCV axes, rigid
+    Ks: Tensor  # [C, 3, 3] intrinsics, pixels
+    width: int
+    height: int
+    background: Tensor  # [3] in [0, 1]
+    rasterize_mode: RasterizeMode = "classic"
+    near_plane: float = NEAR_PLANE  # scene units
+    eps2d: float = EPS2D  # pixels^2
+
+    def __post_init__(self) -> None:
+        tensors = isinstance(self.viewmats, Tensor) and self.viewmats.dim() > 0
+        count = self.viewmats.shape[0] if tensors else 0
+        for name, shape in (
+            ("viewmats", (count, 4, 4)),
+            ("Ks", (count, 3, 3)),
+            ("background", (3,)),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, Tensor):
+                raise DataError(
+                    f"{name} of the views is a {type(value).__name__}; expected a torch.Tensor"
+                )
+            found = tuple(value.shape)
+            if found != shape:
+                raise DataError(f"{name} of the views has shape {found}; expected {shape}")
+        if self.width < 1 or self.height < 1:
+            raise DataError(
+                f"views are {self.width} x {self.height} pixels; expected at least 1 x 1"
+            )
+
+    def __len__(self) -> int:
+        return self.viewmats.shape[0]
+
+    def __repr__(self) -> str:
+        return f"Views({len(self)} of {self.width} x {self.height} pixels, {self.rasterize_mode})"
+
+    @overload
+    def __getitem__(self, index: int) -> View: ...
+    @overload
+    def __getitem__(self, index: slice | list[int] | Tensor) -> Views: ...
+
+    def __getitem__(self, index: Any) -> View | Views:
+        """One view for an integer; several for a slice, a list or tensor of indices, or a boolean
+        mask (C,).
+
+        Raises:
+            IndexError: if there is no such view.
+        """
+        viewmats = self.viewmats[index]
+        Ks = self.Ks[index]
+        kind = View if viewmats.dim() == 2 else Views
+        same = (
+            self.width,
+            self.height,
+            self.background,
+            self.rasterize_mode,
+            self.near_plane,
+            self.eps2d,
+        )
+        return kind(viewmats, Ks, *same)
+
+    def __iter__(self) -> Iterator[View]:
+        return (self[index] for index in range(len(self)))
+
+    def relative_to(self, offset: tuple[float, float, float] | None) -> Views:
+        """The views for a scene with positions relative to an offset, scene units; computed in
+        float64."""
+        if offset is None:
+            return self
+        viewmats = self.viewmats.double()
+        moved = viewmats.clone()
+        moved[:, :3, 3] += viewmats[:, :3, :3] @ torch.tensor(offset, **DOUBLES).to(viewmats.device)
+        return replace(self, viewmats=moved.to(self.viewmats.dtype))
+
+    def spread(self, count: int) -> Views:
+        """At most ``count`` of the views, evenly spaced, with the first and the last."""
+        if count >= len(self):
+            return self
+        return self[spread_indices(len(self), count)]
+
+    def resized(self, max_side: int) -> Views:
+        """The views with the longer side of the image at most ``max_side`` pixels; never
+        enlarges."""
+        factor = max_side / max(self.width, self.height)
+        if factor >= 1:
+            return self
+        width = max(1, round(self.width * factor))
+        height = max(1, round(self.height * factor))
+        stretch = self.Ks.new_tensor([[width / self.width], [height / self.height], [1.0]])
+        return replace(self, Ks=self.Ks * stretch, width=width, height=height)
+
+
+def spread_indices(length: int, count: int) -> list[int]:
+    """At most ``count`` indices below ``length``, evenly spaced, with the first and the last."""
+    if count >= length:
+        return list(range(length))
+    return torch.linspace(0, length - 1, count, **FLOATS).round().long().tolist()

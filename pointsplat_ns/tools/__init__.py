@@ -1,0 +1,1 @@
+"""Tools around the mission: levels, pages, films, folders, the trade-off."""

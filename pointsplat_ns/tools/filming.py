@@ -1,0 +1,201 @@
+"""The public functions to view scenes: films along camera paths, and a viewer in the browser."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.pipeline.options import NO_POSES, ViewOptions
+from pointsplat_ns.pipeline.subject import Source, read_subject
+from pointsplat_ns.pipeline.view_provider import ViewProvider
+from pointsplat_ns.scene.formats.sog_stream import coarser_levels
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.runs import RUN_FILES, may_be_run, open_run, scene_name
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.outputs import outputs_claimed
+from pointsplat_ns.system.progress import Progress, tracked
+from pointsplat_ns.tools.loading import load
+from pointsplat_ns.tools.pages.film import PHOTO_SIDE, FilmSettings, camera_path, render_frames
+from pointsplat_ns.tools.pages.video import check_output, write_frames
+from pointsplat_ns.view_sampling.upright import up_named
+
+if TYPE_CHECKING:
+    from pointsplat_ns.tools.pages.viewer import Viewer
+
+logger = logging.getLogger("pointsplat_ns")
+
+
+@outputs_claimed()
+def render_path(
+    scene: Source,
+    output: str | Path,
+    other: Source | None = None,
+    *,
+    views: Views | str | Path | None = None,
+    up: str | None = None,
+    data: str | Path | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    fps: float = 24.0,
+    seconds: float | None = None,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> int:
+    """Film a scene, or two scenes side by side with the same cameras.
+
+    The film goes exactly through the views or the poses of the run's dataset; without these around
+    an object, or past what shows most of a room.
+
+    Args:
+        scene: N Gaussians, or the path of a scene.
+        output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame
+            alone. It appears when it is complete.
+        other: a second scene in the same frame, to compare with. Both are labelled with their names
+            and counts.
+        views: views to go through, in place of the dataset's poses: views, or a file of cameras
+            (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP
+            model).
+        up: the axis that is up in the scene ("z", "-y") for a film without views; by default the
+            scene's own, or estimated.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the
+            run says.
+        width: width of one scene's picture, pixels; by default that of the photos, at most 960.
+        height: its height, pixels.
+        fps: frames a second.
+        seconds: length; by default 10, or long enough for every pose of a dataset. A folder gets
+            one frame for each of ``views`` by default.
+        force: overwrite existing files.
+        progress: True shows a bar with the time left; a function is called with the share done.
+
+    Returns:
+        The number of frames written.
+
+    Raises:
+        SceneError: if a scene is not usable, or the output cannot be written.
+        DataError: if nothing of the scene is visible, or most views of a file see nothing of it.
+        PointSplatError: if a size, speed or length is not valid.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()[::20]
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.render_path(room, f"{folder}/walk.mp4", width=64, height=48, fps=10, seconds=0.5)
+        5
+    """
+    settings = FilmSettings(width, height, fps, seconds)
+    given = views if isinstance(views, Views) else None
+    options = ViewOptions(poses=None if isinstance(views, Views) else views, up=up, data=data)
+    options.check()
+    kind = check_output(output, force)
+    subject = read_subject(scene, options, given)
+    dense = subject.dense
+    source = subject.views()
+    if source.given is not None and given is None:  # from a file, as large as its photos
+        source = ViewProvider(dense, source.given.resized(PHOTO_SIDE))
+    sources = [scene]
+    loaded = [dense]
+    if other is not None:
+        sources.append(other)
+        loaded.append(_loaded(other).at_offset(dense.offset))
+    if source.given is not None and kind == "frames" and seconds is None:
+        settings = replace(settings, seconds=len(source.given) / fps)
+    cameras, origin = camera_path(dense, source, settings, kind == "picture", options.upward)
+    names = [
+        f"{_name(s, i)}, {len(g):,} Gaussians"
+        for i, (s, g) in enumerate(zip(sources, loaded, strict=True))
+    ]
+    logger.info("%d x %d pixels: %s", cameras.width, cameras.height, origin)
+    frames = render_frames(loaded, cameras, names if len(loaded) > 1 else ())
+    return write_frames(
+        tracked(frames, "rendering", len(cameras), progress), Path(output), kind, fps, force
+    )
+
+
+def open_viewer(
+    scene: Source | None = None,
+    other: Source | None = None,
+    *,
+    views: Views | str | Path | None = None,
+    up: str | None = None,
+    data: str | Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 7007,
+) -> Viewer:
+    """Show a scene, or two scenes with the same camera, in a browser with WebGL 2, which draws.
+
+    It opens upright, at the known or sampled view that shows most of the scene, or at the whole of
+    an object.
+
+    Args:
+        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped
+            on it.
+        other: a second scene in the same frame, to compare with; by default the first is compared
+            with all of itself.
+        views: known views of the first scene, as for :func:`render_path`.
+        up: the axis that is up in the scene ("z", "-y"); by default the scene's own, or estimated.
+        data: folder of the data of ``scene``, as for :func:`render_path`.
+        host: the address to listen on; by default only this machine has access. With another
+            address, every machine that reaches it has access.
+        port: the first port to try; 0 takes any free port.
+
+    Returns:
+        The viewer, to be closed, or used in a ``with`` block; ``url`` is its address.
+
+    Raises:
+        SceneError: if a scene is not usable.
+        DataError: if no Gaussian of the first scene is visible.
+        PointSplatError: if no port is free.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> with ps.open_viewer(ps.example_room()[::20], port=0) as viewer:
+        ...     viewer.url.startswith("http://127.0.0.1:")
+        True
+    """
+    from pointsplat_ns.tools.pages.slider_scenes import ViewedScene
+    from pointsplat_ns.tools.pages.viewer import Viewer
+
+    upward = up_named(up)
+
+    def read(path: Path, name: str) -> ViewedScene:
+        subject = read_subject(path, ViewOptions(poses=NO_POSES))
+        return ViewedScene(name, None, subject.dense, subject.views())
+
+    scenes: list[ViewedScene] = []
+    for index, shown in enumerate(one for one in (scene, other) if one is not None):
+        path = None if isinstance(shown, Gaussians) else Path(shown)
+        if scenes:
+            loaded = _loaded(shown).at_offset(scenes[0].scene.offset)
+            source = ViewProvider(loaded, run=path)
+        else:  # ``upward`` is the page's, not merging's
+            given = views if isinstance(views, Views) else None
+            named = None if isinstance(views, Views) else views
+            subject = read_subject(shown, ViewOptions(poses=named, data=data), given)
+            loaded = subject.dense
+            source = subject.views()
+        levels = (
+            []
+            if path is None or (path / RUN_FILES.config).is_file()
+            else coarser_levels(path, len(loaded))
+        )
+        scenes.append(ViewedScene(_name(shown, index), path, loaded, source, levels))
+    return Viewer(scenes, host, port, upward, None if scenes else read)
+
+
+def _loaded(scene: Source) -> Gaussians:
+    return scene if isinstance(scene, Gaussians) else load(scene)
+
+
+def _name(scene: Source, index: int) -> str:
+    """The name of a scene: its run's experiment, or its file."""
+    if isinstance(scene, Gaussians):
+        return ("first", "second")[index]
+    if may_be_run(scene):
+        with suppress(SceneError):
+            return scene_name(open_run(scene, need_data=False))
+    return Path(scene).resolve().name

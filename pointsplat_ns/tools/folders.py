@@ -1,0 +1,421 @@
+"""Compacts every scene of a folder, and writes a table of the results.
+
+The record of a result ``room.ply`` is ``room.ply.json``. A result is finished if its record has the
+hash of the input file with the options, and that of the result itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import glob
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.pipeline.compact_scene import compact_scene, compact_to_quality
+from pointsplat_ns.pipeline.options import CompactOptions
+from pointsplat_ns.pipeline.quality import judge_of, read_back
+from pointsplat_ns.pipeline.repair_budget import Effort
+from pointsplat_ns.pipeline.trained_refiner import load_refiner
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
+from pointsplat_ns.pruning import Keep
+from pointsplat_ns.rendering.comparison.sizes import size_text
+from pointsplat_ns.scene.discovery import FOLDER_FILES, find_scenes
+from pointsplat_ns.scene.formats import format_like, format_to_write
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.reading import read_scene, save_as, source_file, source_parts
+from pointsplat_ns.system.files import (
+    content_hash,
+    json_text,
+    logger,
+    need_folder,
+    need_new,
+    need_suffix,
+    one_line,
+    read_text,
+    replacing,
+    require_memory,
+    write_csv,
+    write_json,
+)
+from pointsplat_ns.system.outputs import (
+    claim,
+    is_own_file,
+    need_no_links,
+    outputs_claimed,
+    unnamed,
+)
+from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.system.tensors import normal_mode
+from pointsplat_ns.system.workers import Workers, check_jobs
+from pointsplat_ns.tools.pages.gallery import draw_pair, pair_of, write_gallery, write_sheet
+from pointsplat_ns.tools.wording import quality_line
+
+FIGURES = ("before", "after", "megabytes_before", "megabytes", "psnr", "seconds")
+"""Numbers of a result in its record."""
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """The result of one of many scenes.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> print(ps.SceneResult("hall", "hall.ply", "small/hall.ply", "done", psnr=28.0))
+        28.0 dB: edges of small things blur
+    """
+
+    name: str
+    """Path below the folder, without a suffix."""
+    source: str
+    """Path of the file or run."""
+    output: str
+    """Path of the result."""
+    status: Literal[
+        "done", "done before", "failed", "open"
+    ]  # ``done before``: by an earlier call; ``open``: not yet
+    before: int | None = None
+    """Gaussians of the scene."""
+    after: int | None = None
+    """Gaussians of the result."""
+    megabytes_before: float | None = None
+    """Size of the scene's file, 10^6 bytes."""
+    megabytes: float | None = None
+    """Size of the result, 10^6 bytes."""
+    psnr: float | None = None
+    """PSNR against the scene's own renders, dB; None if nothing was compared or they are equal."""
+    seconds: float | None = None
+    """Duration."""
+    error: str = ""
+    """The error in one line; empty if there was none."""
+    note: str = ""
+    """A remark on the result; empty if there is none."""
+
+    def __str__(self) -> str:
+        """What users read of a result."""
+        return "; ".join(
+            filter(None, ("" if self.psnr is None else quality_line(self.psnr, None), self.note))
+        )
+
+
+@normal_mode
+@outputs_claimed()
+def compact_folder(
+    folder: str | Path,
+    output: str | Path | None = None,
+    keep: Keep | str | None = None,
+    refiner: str | Path | None = None,
+    *,
+    by: str | None = None,
+    opacity_weight: float | None = None,
+    sh: str = "all",
+    clean: bool = False,
+    effort: Effort = "quick",
+    seconds: float | None = None,
+    target_db: float | None = None,
+    resolution: tuple[int, int] | str | None = None,
+    data: str | Path | None = None,
+    target_format: str | None = None,
+    html: str | Path | None = None,
+    picture: str | Path | None = None,
+    jobs: int = 1,
+    force: bool = False,
+    progress: bool | Progress = False,
+) -> list[SceneResult]:
+    """Compact every scene of a folder by :func:`compact`, and write the results to another folder.
+
+    Unchanged results of the same scene and options are kept, so another call continues an
+    interrupted one.
+
+    Args:
+        folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each
+            experiment.
+        output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the
+            table ``scenes.csv``; by default beside ``folder``: ``scenes_compact`` for ``scenes``.
+            Each result has the format of its scene's file, or is a PLY where that cannot be
+            written.
+        keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format.
+        refiner: as for :func:`~pointsplat_ns.load_refiner`; None for no refiner.
+        by, opacity_weight, sh, clean, effort, seconds, target_db, resolution: as for
+            :func:`compact`, for each scene.
+        data: folder above the data of the runs. A run whose data is not found gets sampled views,
+            and a note.
+        target_format: suffix of all results, such as ".sog"; by default each result has the format
+            of its scene.
+        html: an .html file for a gallery of all scenes before and after, with links to their files;
+            written at the end.
+        picture: a .png file for the same pictures.
+        jobs: number of processes, which share the cores. With more than one, the program must be a
+            file whose main code is under ``if __name__ == "__main__":``, as for any Python program
+            that starts processes.
+        force: overwrite files of other origin, changed files, and results with other options.
+        progress: True shows a bar; a function is called with the name of the current task and its
+            share done.
+
+    Returns:
+        The result of each scene, sorted by name. One that fails has the status "failed" and does
+        not stop the others.
+
+    Raises:
+        PointSplatError: if an option is not valid.
+        SceneError: if there is no scene, or the output folder, page or picture is one of other
+            results.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[::100], f"{folder}/rooms/hall.ply")
+        ...     [result] = ps.compact_folder(f"{folder}/rooms", keep=50, effort="instant")
+        >>> result.name, result.status, result.before, result.after
+        ('hall', 'done', 629, 50)
+    """
+    folder = Path(folder)
+    target = output_folder(folder) if output is None else Path(output)
+    trained = None if refiner is None else _loaded(refiner, by=by)
+    options = CompactOptions(
+        keep=keep,
+        by=by or "",
+        opacity_weight=opacity_weight,
+        sh=sh,  # type: ignore[arg-type]
+        clean=clean,
+        effort=effort,
+        seconds=seconds,
+        target_db=target_db,
+        resolution=resolution,
+        data=data,
+    ).completed(trained)
+    size = options.size
+    record: dict[str, str | float | bool | None] = {
+        "keep": str(options.budget),
+        "by": options.by,
+        "sh": sh,
+        "clean": clean,
+        "effort": effort,
+        "seconds": seconds,
+        "target_db": target_db,
+        "resolution": None if size is None else size_text(size),
+        "data": None if data is None else str(data),
+        "refiner": None if trained is None else source_file(trained.source).sha256,
+        "format": target_format,
+    }
+    check_jobs(jobs)
+    page, sheet = (None if path is None else Path(path) for path in (html, picture))
+    for shown, end in ((page, ".html"), (sheet, ".png")):
+        if shown is not None:
+            need_suffix(shown, end)
+            need_new(shown, force or (target / FOLDER_FILES.scenes).exists())
+    if os.path.realpath(folder) == os.path.realpath(target):
+        raise SceneError(
+            f"{target}: holds the scenes themselves; name another folder for the results"
+        )
+    tasks = [
+        _Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
+        for name, path in find_scenes(folder).items()
+    ]
+    if not force:
+        claim(target)
+    _describe(target, record, force)
+    drawn = (page, sheet) != (None, None)
+    work = _Compacting(options, refiner, record, drawn, force)
+    results: dict[str, SceneResult] = {}
+    try:
+        with progress_bar(progress) as report, Workers(work, jobs) as workers:
+            report("compact", 0.0)
+            for task, result in workers.results(tasks):
+                results[task.name] = result
+                report("compact", len(results) / len(tasks))
+                if result.status == "failed":
+                    logger.warning("%s failed: %s", result.name, result.error)
+    finally:  # also after an interruption
+        for task in tasks:
+            if task.name not in results:  # its process may have ended while it wrote
+                for part in task.output.parent.glob(f".{glob.escape(task.output.name)}*.part"):
+                    part.unlink(missing_ok=True)
+        rows = [results.get(task.name) or _known(task, _read_record(task)) for task in tasks]
+        write_csv([dataclasses.asdict(row) for row in rows], target / FOLDER_FILES.scenes_table)
+        if page is not None:
+            write_gallery(page, folder.resolve().name, rows)
+        if sheet is not None:
+            write_sheet(sheet, rows)
+    return rows
+
+
+def output_folder(folder: Path) -> Path:
+    """The default output folder, beside a folder: ``scenes_compact`` for ``scenes``."""
+    place = Path(os.path.abspath(folder))
+    return unnamed(place.with_name(f"{place.name}_compact"))
+
+
+_loaded = functools.cache(load_refiner)  # once in each process
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A scene to work on, and the file to write."""
+
+    name: str
+    source: Path
+    output: Path
+
+    def result(
+        self, status: Literal["done", "done before", "failed", "open"], **facts: Any
+    ) -> SceneResult:
+        return SceneResult(self.name, str(self.source), str(self.output), status, **facts)
+
+    @property
+    def folder(self) -> Path:
+        """The folder of all results."""
+        return self.output.parents[self.name.count("/")]
+
+    @property
+    def record(self) -> Path:
+        """The file with the figures and hashes of the result."""
+        return self.output.with_name(f"{self.output.name}.json")
+
+
+def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
+    """Write the options beside the results. Raises SceneError if the output is no folder, or holds
+    results of other options."""
+    need_folder(output)
+    path = output / FOLDER_FILES.scenes
+    text = json_text(options) + "\n"
+    try:
+        other = path.exists() and not path.is_symlink() and read_text(path) != text
+    except (OSError, ValueError) as error:
+        raise SceneError(
+            f"{path}: cannot be read ({one_line(error)}); name another folder for the results"
+        ) from error
+    if other and not force:
+        raise SceneError(
+            f"{output}: holds results of other options, see {path.name}; name another folder, or "
+            "overwrite them with --force"
+        )
+    write_json(options, path)
+
+
+@dataclass(frozen=True)
+class _Compacting:
+    """Compacts a scene of a folder, unless that is done. It is pickled for other processes."""
+
+    options: CompactOptions
+    refiner: str | Path | None  # loaded by each process
+    record: Mapping[str, Any]  # what tells results of other options apart
+    drawn: bool  # whether a picture of each scene before and after is wanted
+    force: bool
+
+    def __call__(self, task: _Task) -> SceneResult:
+        """The result of a scene. An error gives one with the status ``failed``, and leaves no
+        file."""
+        start = time.perf_counter()
+        try:
+            for part in source_parts(task.source):
+                require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
+            need_no_links(task.folder, task.output)
+            source = source_file(task.source)
+            text = json.dumps([source.sha256, self.record], sort_keys=True)
+            key = hashlib.sha256(text.encode()).hexdigest()
+            record = _read_record(task)
+            whole = (
+                record is not None
+                and is_own_file(task.output)
+                and content_hash(task.output) == record["sha256"]
+            )
+            if not whole and os.path.lexists(task.output) and not self.force:
+                raise SceneError(
+                    f"{task.output}: exists already, and was not made by an earlier call or was "
+                    "changed since; name another folder, or overwrite it with --force"
+                )
+            if record is None or not whole or record["key"] != key:
+                return self._make(task, source.bytes, key, start)
+            if self.drawn and not is_own_file(pair_of(task.output)):
+                self._draw(task, read_scene(task.source), read_scene(task.output))
+            return _known(task, record)
+        except Exception as error:  # one scene must not stop the others
+            kind = (
+                "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
+            )
+            return task.result(
+                "failed",
+                seconds=time.perf_counter() - start,
+                error=kind + one_line(error, limit=1000),
+            )
+
+    def _make(self, task: _Task, source_bytes: int, key: str, start: float) -> SceneResult:
+        """Write a result and its record. A process killed in between leaves the record alone: the
+        scene is open."""
+        new = not self.force and not os.path.lexists(task.output)
+        dense = read_scene(task.source)
+        kind = format_to_write(task.output)
+        options = dataclasses.replace(self.options, target_format=kind.suffix)
+        views = ViewProvider(dense, run=task.source, data=options.data, resolution=options.size)
+        trained = None if self.refiner is None else _loaded(self.refiner, by=options.by)
+        compact = compact_to_quality if options.searched else compact_scene
+        made = compact(dense, options, views, refiner=trained)
+        if made.interrupted:
+            raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
+        scene = made.scene
+        same = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
+        same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
+        differs = not same or kind.suffix != ".ply"
+        judge = (made.judge or judge_of(dense, views)) if differs else None
+        with replacing(task.output, named=False, new=new) as part:
+            save_as(kind, scene, part, name=task.output)
+            written = read_back(scene, part, kind)
+            psnr = math.inf if judge is None else judge.psnr(written)[0]
+            done = task.result(
+                "done",
+                before=len(dense),
+                after=len(scene),
+                megabytes_before=source_bytes / 1e6,
+                megabytes=part.stat().st_size / 1e6,
+                psnr=psnr if math.isfinite(psnr) else None,
+                seconds=time.perf_counter() - start,
+                note="kept whole" if same else f"no dataset: {views.missing}" * bool(views.missing),
+            )
+            # These must not stand beside the new record.
+            for old in (pair_of(task.output), *(() if new else (task.output,))):
+                old.unlink(missing_ok=True)
+            proofs = {"key": key, "options": self.record, "sha256": content_hash(part)}
+            write_json({**dataclasses.asdict(done), **proofs}, task.record)
+        if self.drawn:
+            self._draw(task, dense, written)
+        return done
+
+    def _draw(self, task: _Task, before: Gaussians, after: Gaussians) -> None:
+        """Draw a scene and its result to a file; nothing if nothing of the scene is visible."""
+        after = after if after.offset is None else after.at_offset(before.offset)
+        views = ViewProvider(before, run=task.source, data=self.options.data)
+        with suppress(DataError):
+            draw_pair(before, after, views.known(VIEW_COUNTS.opening), pair_of(task.output))
+
+
+def _read_record(task: _Task) -> dict[str, Any] | None:
+    """The record of a result; None if it is missing or damaged."""
+    if not is_own_file(task.record):
+        return None
+    try:
+        record = json.loads(read_text(task.record))
+        texts = all(isinstance(record[name], str) for name in ("key", "sha256", "note"))
+        numbers = all(record[name] is None or 0 <= record[name] < 1e18 for name in FIGURES)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):
+        return None
+    return record if texts and numbers else None
+
+
+def _known(task: _Task, record: dict[str, Any] | None) -> SceneResult:
+    """The result in a record; an open one without."""
+    if record is None:
+        return task.result("open")
+    return task.result("done before", **{name: record[name] for name in (*FIGURES, "note")})

@@ -1,0 +1,107 @@
+"""The distance from which on a level of detail shows enough, by its renders in near and farther
+views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch.nn.functional import avg_pool2d
+
+from pointsplat_ns.rendering import render_depth
+from pointsplat_ns.rendering.comparison.closeness import Reference
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.system.tensors import DOUBLES
+
+ENOUGH = 30.0
+"""PSNR in dB against the dense scene from which on a level is taken to show as much, see
+:func:`pixel_size_for`."""
+
+
+def pixel_sizes(
+    dense: Gaussians, reference: Reference, levels: Sequence[Gaussians], near: Sequence[float]
+) -> list[float] | None:
+    """Scene units a pixel from which on each level shows enough; None if the dense scene covers no
+    pixel.
+
+    Args:
+        dense: the scene that the levels were made of.
+        reference: its renders.
+        levels: their scenes.
+        near: PSNR of each in the views that every command judges in, dB.
+    """
+    distance = median_depth(dense, reference)
+    if distance is None:
+        return None
+    pixel = distance / float(reference.views.Ks[:, 1, 1].median())
+    afar = far_references(reference)
+    whole, *others = (
+        {times: far.psnr(scene)[0] for times, far in afar.items()} for scene in (dense, *levels)
+    )
+    return [
+        pixel_size_for({1: psnr, **psnrs}, whole, pixel)
+        for psnr, psnrs in zip(near, others, strict=True)
+    ]
+
+
+def pixel_size_for(psnrs: dict[int, float], whole: dict[int, float], pixel_size: float) -> float:
+    """Scene units a pixel from which on a level shows enough: its PSNR is :data:`ENOUGH`, or that
+    of the dense scene where this is lower.
+
+    A line through the measured differences over the logarithm of the distance crosses zero there,
+    from an eighth of the compared distance to 64 times it.
+
+    Args:
+        psnrs: PSNR in dB of the level, by multiple of the distance.
+        whole: the same of the dense scene itself.
+        pixel_size: of the compared views at the median depth, scene units.
+    """
+    short = [
+        min(psnr, 99.0) - min(ENOUGH, whole.get(times, ENOUGH)) for times, psnr in psnrs.items()
+    ]
+    doublings = torch.tensor([*psnrs], **DOUBLES).log2()
+    gap = torch.tensor(short, **DOUBLES)
+    about = doublings - doublings.mean()
+    slope = max(
+        float((about @ gap) / about.square().sum().clamp_min(1e-9)), 1.0
+    )  # dB each time twice as far
+    return pixel_size * 2.0 ** min(max(float(doublings.mean() - gap.mean() / slope), -3.0), 6.0)
+
+
+def far_references(reference: Reference) -> dict[int, Reference]:
+    """Target images at each multiple of the distance (2, 4, 8), as far as the compared views have
+    enough pixels.
+
+    The scene covers a smaller part of the picture there, so a target is a near render with each
+    square of ``times`` x ``times`` pixels averaged. The dense scene itself does not reach inf: the
+    rasterizer draws Gaussians no thinner than a pixel, so its distant renders are coarser than the
+    targets. A level can be closer to the targets than the dense scene.
+    """
+    views = reference.views
+    found = {}
+    for times in (2, 4, 8):
+        if times > min(views.width, views.height):
+            continue
+        shrink = views.Ks.new_tensor([[1 / times], [1 / times], [1.0]])
+        smaller = replace(
+            views, Ks=views.Ks * shrink, width=views.width // times, height=views.height // times
+        )
+        targets = [
+            avg_pool2d(image.double().permute(2, 0, 1), times).permute(1, 2, 0)
+            for image in reference.renders
+        ]
+        found[times] = Reference(smaller, targets, reference.covered)
+    return found
+
+
+@torch.no_grad()
+def median_depth(dense: Gaussians, reference: Reference) -> float | None:
+    """The median depth over the covered pixels of the compared views, scene units; None if no pixel
+    is covered."""
+    depths = []
+    for view in replace(reference.views, rasterize_mode="classic").resized(100):
+        depth, alpha = render_depth(dense, view)
+        depths.append(depth[alpha > 0.5].double().cpu())
+    covered = torch.cat(depths)
+    return float(covered.median()) if len(covered) else None

@@ -1,0 +1,232 @@
+"""Measures one point: compares a smaller scene with the dense scene and with photos, and times its
+frames.
+
+On a shared machine the time of a frame may double within a minute. So each frame is timed beside a
+frame of the dense scene in the same view: both slow down alike, and the ratio of their times stays.
+"""
+
+from __future__ import annotations
+
+import platform
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.metrics import SSIM_WINDOW, ssim
+from pointsplat_ns.pipeline.photos.examples import Example, Photos
+from pointsplat_ns.pipeline.quality import Judge
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
+from pointsplat_ns.pruning import need_usable, ply_bytes
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.sizes import middle_sized
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.image_files import in_unit_range
+from pointsplat_ns.scene.views import View, Views, spread_indices
+from pointsplat_ns.system.cores import OtherPrograms, cores
+from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.system.threads import most_threads, now
+from pointsplat_ns.tools.tradeoff.measured_scene import Subject
+from pointsplat_ns.tools.tradeoff.points import DENSE, ImageMetrics, Point, Setting, Speed
+from pointsplat_ns.tools.wording import origin_text
+
+ROUNDS = 3
+"""Number of timed frames of each view, alternating between the dense scene and the measured
+scene."""
+
+
+class JudgedViews(NamedTuple):
+    """The views that scenes are drawn and timed in, their photos of the same size in [0, 1], if
+    there are some, and a text on their origin."""
+
+    views: Views
+    photos: list[Example] | None
+    origin: str
+
+
+def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
+    """At most ``count`` views of a middle size, and a note. They are the views of held-out photos,
+    which are averaged over the areas of pixels, or else those of the
+    :class:`~pointsplat_ns.pipeline.quality.Judge`. Raises DataError if there are none."""
+    note = ""
+    if subject.held_out is not None:
+        try:
+            views, photos, note = photos_of_one_size(subject.held_out(), count)
+            whole = views if subject.resolution is None else views.resized(max(subject.resolution))
+            middle = middle_sized(whole)
+            small = views.resized(max(middle.width, middle.height))
+            if small is not views:
+                photos = [_averaged(photo, view) for photo, view in zip(photos, small, strict=True)]
+            return JudgedViews(
+                small, photos, f"held-out photos of {subject.photos or 'the dataset'}"
+            ), note
+        except (SceneError, DataError) as error:
+            note = f"there are no held-out photos: {error}"
+    source = subject.new_views()
+    return JudgedViews(
+        source.compared().spread(min(count, VIEW_COUNTS.compared)), None, origin_text(source.origin)
+    ), note
+
+
+def photos_of_one_size(photos: Photos, count: int) -> tuple[Views, list[Example], str]:
+    """At most ``count`` photos of one size, their views, and a note on photos of other sizes."""
+    shown = [photos[index] for index in spread_indices(len(photos), count)]
+    if not shown:
+        raise DataError("no photo is held out")
+    sizes = [example.target.shape for example in shown]
+    size = max(sizes, key=sizes.count)
+    of_size = [example for example in shown if example.target.shape == size]
+    first = of_size[0].view
+    viewmats, Ks = (
+        torch.stack(mats)
+        for mats in zip(*((s.view.viewmat, s.view.K) for s in of_size), strict=True)
+    )
+    views = Views(viewmats, Ks, first.width, first.height, first.background, first.rasterize_mode)
+    others = len(shown) - len(of_size)
+    note = (
+        f"{others} of {len(shown)} held-out photos are of another size and left out"
+        if others
+        else ""
+    )
+    return (
+        views,
+        [example._replace(target=in_unit_range(example.target).float()) for example in of_size],
+        note,
+    )
+
+
+def _averaged(photo: Example, view: View) -> Example:
+    """A photo reduced to a view, by the mean of each area; a pixel counts if half of its area
+    does."""
+
+    def reduced(image: Tensor) -> Tensor:
+        planes = image.permute(2, 0, 1)[None].float()
+        return torch.nn.functional.interpolate(planes, (view.height, view.width), mode="area")[
+            0
+        ].permute(1, 2, 0)
+
+    return Example(
+        view, reduced(photo.target), None if photo.mask is None else reduced(photo.mask) >= 0.5
+    )
+
+
+class Measurer:
+    """Judges scenes as every command does, and measures them in the same views: frame times, and
+    errors against photos if there are some. ``views`` is the largest number of views that are
+    timed, and of photos. Raises SceneError if no Gaussian can be drawn; DataError if there are no
+    views, or they are too small for SSIM."""
+
+    def __init__(self, subject: Subject, views: int):
+        need_usable(subject.dense)
+        self.subject = subject
+        self.dense = subject.dense
+        self._dense_ms: float | None = None
+        """Time of a frame of the dense scene, which is measured first: the unit of measured
+        ratios."""
+        self.judge = Judge(self.dense, subject.new_views())
+        self.judged, self.note = views_to_judge(subject, views)
+        shown = self.judged.views
+        if min(shown.width, shown.height) < SSIM_WINDOW:
+            raise DataError(
+                f"views are {shown.width} x {shown.height} pixels; expected at least "
+                f"{SSIM_WINDOW} a side"
+            )
+
+    def point(self, setting: Setting, scene: Gaussians, seconds: float, show: Progress) -> Point:
+        """The point of a setting, from its scene and the seconds of making it; the dense scene
+        comes first. ``show`` is called with the name of the current task and its share done."""
+        show("comparing", 0.0)
+        quality = self.judge.quality(scene)
+        assert quality.ssim is not None
+        against_photos = self._against_photos(scene)
+        speed, others_cores = self._speed(scene, show)
+        if setting.by == DENSE:  # as fast as itself
+            speed = Speed(1.0, speed.low / speed.median, speed.high / speed.median)
+        assert self._dense_ms is not None
+        return Point(
+            **self.subject.names(setting),
+            by=setting.by,
+            share=setting.count / len(self.dense),
+            gaussians=len(scene),
+            repair=setting.repair,
+            bytes=ply_bytes(len(scene), scene.sh_degree),
+            against_dense=ImageMetrics(quality.psnr, quality.ssim),
+            against_photos=against_photos,
+            speed=speed,
+            frame_ms=self._dense_ms / speed.median,
+            fill=quality.fill,
+            seconds=seconds,
+            others_cores=others_cores,
+        )
+
+    @torch.no_grad()
+    def _against_photos(self, scene: Gaussians) -> ImageMetrics | None:
+        if self.judged.photos is None:
+            return None
+        photos = self.judged.photos
+        views = self.judged.views
+        pairs = [(photo, render(scene, view)) for photo, view in zip(photos, views, strict=True)]
+        similar = fmean(float(ssim(*photo.compared(image))) for photo, image in pairs)
+        return ImageMetrics(fmean(photo.psnr(image) for photo, image in pairs), similar)
+
+    @torch.no_grad()
+    def _speed(self, scene: Gaussians, show: Progress) -> tuple[Speed, float | None]:
+        """The measured ratio of frames, and the cores that other programs used meanwhile."""
+        others = OtherPrograms()
+        pairs = []
+        views = self.judged.views
+        for _ in range(ROUNDS):
+            for view in views:
+                pairs.append((_timed(self.dense, view), _timed(scene, view)))
+                show("timing frames", len(pairs) / (ROUNDS * len(views)))
+        rounds = np.array(pairs).reshape(ROUNDS, len(views), 2)  # seconds
+        if self._dense_ms is None:
+            self._dense_ms = 1000 * float(np.median(rounds[..., 0].min(axis=0)))
+        ratios = np.median(rounds[..., 0] / rounds[..., 1], axis=0)  # of each view
+        low, median, high = np.quantile(ratios, (0.25, 0.5, 0.75)).tolist()
+        return Speed(median, low, high), others.cores()
+
+
+def _timed(scene: Gaussians, view: View) -> float:
+    """Seconds of drawing a view."""
+    start = now(scene.device)
+    render(scene, view)
+    return now(scene.device) - start
+
+
+def machine_text(device: torch.device) -> str:
+    """Processor, number of threads, device and version of torch, as text."""
+    # of Linux
+    threads = most_threads()
+    about = Path("/proc/cpuinfo")
+    models = (
+        re.findall(r"^model name\s*: *(.*)", about.read_text("utf-8", "replace"), re.M)
+        if about.exists()
+        else []
+    )
+    processor = next(iter(models), "") or platform.processor() or platform.machine()
+    where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+    return (
+        f"{processor}, {threads} thread{'s' if threads != 1 else ''}, {where}, torch "
+        f"{torch.__version__}"
+    )
+
+
+def busy_note(others: Sequence[float | None]) -> str:
+    """A line of text if other programs disturbed measurements, from the cores that they used during
+    each, which are None where nothing was timed; else empty. A quarter of a core does not change
+    medians."""
+    timed = [used for used in others if used is not None]
+    disturbed = [used for used in timed if used + most_threads() > cores() + 0.25]
+    if not disturbed:
+        return ""
+    return (
+        f"the machine was busy: while {len(disturbed)} of {len(timed)} points were timed, other "
+        f"programs took up to {max(disturbed):.1f} of {cores()} cores; times are not to be trusted"
+    )

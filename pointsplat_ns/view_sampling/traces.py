@@ -1,0 +1,197 @@
+"""Traces of photos in the Gaussians of a scene: where photos were taken, and what they showed.
+
+Training starts without SH, or with round Gaussians of one colour. Each photo of a Gaussian changes
+its SH coefficients and flattens it onto the surface. A Gaussian without photos keeps its initial
+values. So the SH energy and the flatness of a neighbourhood grow with the number of photos that
+showed it, including the effect of occlusion.
+
+A photo from direction d moves the coefficients f along Y(d), the SH basis there. So the
+direction-dependent part of the colour, f . Y, is large towards photo places and small elsewhere: a
+photo place is one where it is large for many Gaussians. Without SH, sizes give weaker evidence:
+training splits Gaussians that are large in a photo, so they are small near photo places and large
+far away.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool1d
+
+from pointsplat_ns.rendering.spherical_harmonics import sh_basis
+from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.system.pieces import in_pieces
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
+from pointsplat_ns.view_sampling.settings import looking
+
+MIN_SH = 1e-4
+"""Length of an SH coefficient vector, root of the sum of squares, up to which it counts as
+untrained."""
+
+
+def trace_factors(scene: Gaussians, members: Tensor) -> Tensor:
+    """Trace factor of each member: large if photos showed its neighbourhood well, 1 for the median
+    member.
+
+    Args:
+        scene, members: as for :func:`traces_around`.
+
+    Returns:
+        (n,) float32, see :func:`factors_of`.
+    """
+    return factors_of(*traces_around(scene, members))
+
+
+def traces_around(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean SH energy and mean flatness of each member's neighbourhood.
+
+    Args:
+        scene: N Gaussians.
+        members: (n,) indices, n at least 1, in an order that puts neighbours together.
+
+    Returns:
+        (n,) each, float64.
+    """
+    energies = in_pieces(lambda rows: _energy(scene.features_rest[rows].double()), members)
+    flatnesses = in_pieces(lambda rows: _flatness(scene.scales[rows].double()), members)
+    energy, flatness = (
+        means_around(values, looking().trace_neighbourhood) for values in (energies, flatnesses)
+    )
+    return energy, flatness
+
+
+def factors_of(energy: Tensor, flatness: Tensor) -> Tensor:
+    """The mean energy (n,) and the exponential of the mean flatness (n,), each to a power, relative
+    to the median, (n,) float32; 1 for all if all are equal."""
+    logs = (
+        looking().energy_exponent * (energy + MIN_SH**2).log()
+        + looking().flatness_exponent * flatness
+    )
+    return (
+        (logs - logs.median())
+        .clamp(-looking().max_log_factor, looking().max_log_factor)
+        .exp()
+        .float()
+    )
+
+
+def _energy(sh: Tensor) -> Tensor:
+    """Sums of squares (n,) of SH coefficients (n, K, 3), clamped at 1,000; a colour of 1 is
+    white."""
+    return sh.clamp(-1e3, 1e3).square().sum((1, 2))
+
+
+def _flatness(scales: Tensor) -> Tensor:
+    """Logarithms (n,) of width over thickness from log-scales (n, 3)."""
+    thickness, width, length = scales.sort(dim=1).values.unbind(1)
+    # flat ones of any kind are alike
+    return (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, 7.0)
+
+
+def means_around(values: Tensor, count: int) -> Tensor:
+    """Moving average (n,) of values (n,) over ``count`` items, an odd number; fewer at the ends."""
+    means: Tensor = avg_pool1d(
+        values[None, None], count, stride=1, padding=count // 2, count_include_pad=False
+    )
+    return means[0, 0]
+
+
+class PhotoTraces:
+    """Photo places estimated from a scene, in its unit. A random selection of Gaussians with SH is
+    compared with places. If there are none, the sizes of four times as many are used, because a
+    single size is weaker evidence."""
+
+    places: Tensor
+    """(P, 3) float64, uniform in a box 1.5 times that of the Gaussians; empty if no Gaussian can be
+    compared."""
+    shares: Tensor
+    """(P,) of the photos, which sum to 1."""
+    sure: bool
+    """Whether the best place explains enough to be a photo place."""
+
+    def __init__(self, scene: Gaussians):
+        generator = torch.Generator().manual_seed(0)
+        count = looking().evidence_count
+        # some are faint
+        some = scene[torch.randperm(len(scene), generator=generator, device="cpu")[: 8 * count]]
+        sh = unit_sh(some.features_rest)
+        opaque = some.usable() & (some.alphas > looking().min_opacity)
+        with_sh = opaque & (sh != 0).any(2).any(1)
+        self.has_sh = bool(with_sh.any())
+        """Whether SH are compared, instead of sizes."""
+        chosen = with_sh.nonzero()[:count, 0] if self.has_sh else opaque.nonzero()[: 4 * count, 0]
+        self._means = some.means[chosen].double()
+        self._sh = sh[chosen]
+        self._sizes = log_widths(some.scales[chosen])
+        self.places = torch.zeros(0, 3, **DOUBLES)
+        self.shares = torch.zeros(0, **FLOATS)
+        self.sure = False
+        if len(chosen) == 0:
+            return
+        low, high = torch.quantile(self._means, self._means.new_tensor([0.02, 0.98]), dim=0)
+        offsets = torch.rand(1_000, 3, generator=generator, **FLOATS).double() - 0.5
+        self.places = 0.5 * (low + high) + 1.5 * (high - low) * offsets
+        found = self.evidence(self.places)
+        best = float(found.max())
+        shares = (found.clamp_min(0) / max(best, 1e-9)) ** looking().photo_share_exponent + 1e-12
+        self.shares = shares / shares.sum()
+        self.sure = best >= (
+            looking().min_sh_evidence if self.has_sh else looking().min_size_evidence
+        )
+
+    def evidence(self, places: Tensor) -> Tensor:
+        """Evidence (P,) float32 for places (P, 3): the mean of the :func:`explained_energy`;
+        without SH, the correlation of the logarithms of size and distance."""
+        if self.has_sh:
+            return torch.stack(
+                [explained_energy(self._means - place, self._sh).mean() for place in places]
+            )
+        distances = (
+            (self._means - place).norm(dim=1).clamp_min(torch.finfo(torch.float64).tiny)
+            for place in places
+        )
+        return torch.stack(
+            [correlation(distance.log(), self._sizes) for distance in distances]
+        ).float()
+
+
+def unit_sh(sh: Tensor) -> Tensor:
+    """SH coefficients (n, K, 3) normalised per Gaussian, float32; 0 if their length is at most
+    :data:`MIN_SH`."""
+    sh = sh.double().clamp(-1e3, 1e3)
+    length = _energy(sh).sqrt()[:, None, None]
+    return torch.where(length > MIN_SH, sh / length.clamp_min(MIN_SH), 0.0).float()
+
+
+def log_widths(scales: Tensor) -> Tensor:
+    """Logarithms (n,) of the geometric means of the two larger standard deviations from log-scales
+    (n, 3), float64; finite, or NaN if a log-scale is."""
+    return scales.double().clamp(-100.0, 100.0).sort(dim=1).values[:, 1:].mean(1)
+
+
+def correlation(a: Tensor, b: Tensor) -> Tensor:
+    """Pearson's correlation coefficient of a (n,) and b (n,), a scalar; 0 if either is constant."""
+    return torch.corrcoef(torch.stack([a, b]))[0, 1].nan_to_num(0.0)
+
+
+def explained_energy(offsets: Tensor, sh: Tensor) -> Tensor:
+    """Share of the SH energy along the basis in one direction per Gaussian, relative to its mean
+    over SH of random directions.
+
+    Args:
+        offsets: (n, 3) from an eye to Gaussians, of any length.
+        sh: (n, K, 3) SH coefficients of degrees 1 and up, of length 1.
+
+    Returns:
+        (n,) float32 in [0, K]: large if photos were taken from that direction.
+    """
+    directions = (
+        offsets / offsets.norm(dim=1, keepdim=True).clamp_min(torch.finfo(offsets.dtype).tiny)
+    ).float()
+    basis = sh_basis(directions, math.isqrt(sh.shape[1] + 1) - 1)[:, 1:]
+    along = (sh * basis[:, :, None]).sum(1).square().sum(1) / basis.square().sum(1).clamp_min(
+        MIN_SH
+    )
+    return along * sh.shape[1]
