@@ -235,6 +235,7 @@ def test_a_report_has_the_settings_of_the_network_and_of_pruning(report):
         "stem": "conv",
         "raw_inputs": False,
         "means_reach": 0.05,
+        "units": "scene",
         "keep": 0.5,
         "by": "paper",
         "opacity_weight": None,
