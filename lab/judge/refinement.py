@@ -40,11 +40,12 @@ HEADS = ("kept", "way", "PSNR, dB", "over the selection", "worst scene", "over t
 
 PAGE = """# What one pass of a network brings over a selection
 
-`lab/judge/refinement.py` measured [{name}]({name}) and writes this page from it. PSNR is against renders of the dense
-scene, over the pixels that it covers, in {views} views of camera paths written by hand, {width} pixels wide. The best
-constant is one number added to all log-scales, chosen for each scene and budget by these same views: a control that
-knows the answer. The worst scene is the one where a way gains least over the selection. The figures hold for these
-scenes at this width; no network was trained on them.
+`lab/judge/refinement.py` measured [{name}]({name}) and writes this page from it. PSNR is against
+renders of the dense scene, over the pixels that it covers, in {views} views of camera paths written
+by hand, {width} pixels wide. The best constant is one number added to all log-scales, chosen for
+each scene and budget by these same views: a control that knows the answer. The worst scene is the
+one where a way gains least over the selection. The figures hold for these scenes at this width; no
+network was trained on them.
 
 """
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import random
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -118,8 +119,9 @@ class DenseScene:
         smaller = settings.prune(dense)
         return smaller, len(smaller) / max(1, len(dense))
 
-    def training_background(self) -> Tensor:
-        """Background colour (3,) of a training step, in [0, 1]."""
+    def training_background(self, data: Mapping[str, Any]) -> Tensor:
+        """Background of a training step whose frame has this data, in [0, 1]: a colour (3,) or an
+        image (H, W, 3)."""
         return self.background
 
     def cameras(self, split: Split) -> Cameras:

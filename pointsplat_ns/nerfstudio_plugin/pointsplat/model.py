@@ -249,7 +249,7 @@ class PointSplatModel(SplatfactoModel):
     ) -> dict[str, Tensor]:
         """Render Gaussians as a scene is drawn, from a camera of shape (1,): ``rgb`` (H, W, 3) in
         [0, 1], ``accumulation`` (H, W, 1), ``background`` (H, W, 3), and in evaluation ``depth``
-        (H, W, 1) in scene units. The ``background`` (3,) is by default the scene's."""
+        (H, W, 1) in scene units. The ``background`` (3,) or (H, W, 3) is by default the scene's."""
         width = int(camera.width.item())
         height = int(camera.height.item())
         image, alpha, _ = self.config.rasterize(
@@ -301,7 +301,7 @@ class PointSplatModel(SplatfactoModel):
         outputs: dict[str, Tensor] = {}
         pairs = []
         for camera, data in frames:
-            outputs = self.draw(refined, scene, camera, scene.training_background())
+            outputs = self.draw(refined, scene, camera, scene.training_background(data))
             mask = data.get("mask", 1)
             pairs.append((outputs["rgb"] * mask, self.photo_of(data, outputs["background"]) * mask))
         pixel_loss = torch.stack(

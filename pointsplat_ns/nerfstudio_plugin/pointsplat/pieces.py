@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
@@ -21,7 +21,7 @@ from pointsplat_ns.nerfstudio_plugin.frames import Frames
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, RenderedDataset
 from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.refinement.scene_cut import SceneCut, cut_scene
-from pointsplat_ns.rendering import render_with_alpha
+from pointsplat_ns.rendering import render, render_with_alpha
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.files import write_tensors
 
@@ -50,6 +50,10 @@ class CutScene:
         """Indices of the dense scene's Gaussians in a piece. # [n] int64"""
         return (self._pieces == number).nonzero()[:, 0]
 
+    def rest(self, number: int) -> Gaussians:
+        """The dense scene without a piece."""
+        return self.whole.dense(keep=True)[self._pieces != number]
+
     @cached_property
     def _pieces(self) -> Tensor:
         return self.cut.pieces_of(self.whole.dense(keep=True).means)
@@ -74,8 +78,7 @@ class CutScene:
 
 
 class ScenePiece(DenseScene):
-    """A piece of a dense scene, drawn alone: with opacity, so that it can be put over any
-    background.
+    """A piece of a dense scene, drawn over the rest of it.
 
     Args:
         of: the scene and its cut.
@@ -107,9 +110,9 @@ class ScenePiece(DenseScene):
         """That of the whole scene."""
         return self.of.whole.identity
 
-    def training_background(self) -> Tensor:
-        """A random colour (3,) of torch's generator: behind a hole in a piece may be anything."""
-        return torch.rand(3, dtype=torch.float32, device="cpu")
+    def training_background(self, data: Mapping[str, Any]) -> Tensor:
+        """The rest of the scene (H, W, 3) in [0, 1]."""
+        return data["behind"].to(torch.float32) / 255
 
     def read_dense(self) -> Gaussians:
         """The piece's Gaussians, of the dense scene."""
@@ -139,8 +142,18 @@ class ScenePiece(DenseScene):
         return self.rendered["train"]
 
 
+class PieceRenders(NamedTuple):
+    """Cameras (C,) of a piece, and what they see."""
+
+    cameras: Cameras
+    images: Tensor  # [C, H, W, 4] uint8, the piece alone, colours not multiplied by opacity
+    behind: Tensor  # [C, H, W, 3] uint8, the rest of the dense scene
+
+
 class RenderedPiece(RenderedDataset):
-    """Renders of a piece with opacity, kept in a file if the training keeps pieces in a folder."""
+    """Renders of a piece with opacity, and of the rest of its scene, over which it is trained: what
+    shows through a hole, and what is spilled on, are what they are in the scene. They are kept in a
+    file if the training keeps pieces in a folder."""
 
     def __init__(self, piece: ScenePiece):
         super().__init__(piece, "train")
@@ -149,19 +162,24 @@ class RenderedPiece(RenderedDataset):
     @cached_property
     def cameras(self) -> Cameras:
         """The cameras, sampled when they are first needed, or those of the piece's file."""
-        return self._content()[0]
+        return self._content().cameras
 
     @torch.no_grad()
     def get_data(
         self, image_idx: int, image_type: Literal["uint8", "float32"] = "uint8"
     ) -> dict[str, Any]:
         """A render (H, W, 4) on the CPU, integers in [0, 255], colours not multiplied by opacity,
-        and its index."""
-        return {"image": self._content()[1][image_idx], "image_idx": image_idx}
+        its index, and the rest of the scene (H, W, 3) as ``behind``."""
+        _, images, behind = self._content()
+        return {
+            "image": images[image_idx],
+            "image_idx": image_idx,
+            "behind": behind[image_idx],
+        }
 
-    def _content(self) -> tuple[Cameras, Tensor]:
-        """Cameras (C,) and renders (C, H, W, 4) uint8, from memory, from the file, or made now.
-        Raises DataError, which names the scene, if nothing of the piece is visible."""
+    def _content(self) -> PieceRenders:
+        """Cameras and renders, from memory, from the file, or made now. Raises DataError, which
+        names the scene, if nothing of the piece is visible."""
         piece = self._piece
         key = "piece", piece.name
         found = piece.cache.get(key)
@@ -170,25 +188,27 @@ class RenderedPiece(RenderedDataset):
             kept = None if path is None or not path.is_file() else read_piece(path)
             found = self._made() if kept is None else kept
             if kept is None and path is not None:
-                write_piece(path, *found)
+                write_piece(path, found)
             piece.cache.put(key, found)
         return found
 
     @torch.no_grad()
-    def _made(self) -> tuple[Cameras, Tensor]:
+    def _made(self) -> PieceRenders:
         piece = self._piece
         cameras = piece.cameras("train")
         dense = piece.dense(keep=True).to(piece.device)
+        rest = piece.of.rest(piece.number).to(piece.device)
         images = []
+        behind = []
         for index in range(len(cameras)):
             views = views_of_cameras(
                 cameras[index : index + 1], piece.background, piece.rasterize_mode
             )
             color, alpha = render_with_alpha(dense, views[0])
             straight = (color / alpha.clamp(min=1e-6)).clamp(0, 1)
-            image = torch.cat([straight, alpha], dim=2)
-            images.append((255 * image).round().to(torch.uint8).cpu())
-        return cameras, torch.stack(images)
+            images.append(_bytes(torch.cat([straight, alpha], dim=2)))
+            behind.append(_bytes(render(rest, views[0])))
+        return PieceRenders(cameras, torch.stack(images), torch.stack(behind))
 
     @property
     def _path(self) -> Path | None:
@@ -199,7 +219,7 @@ class RenderedPiece(RenderedDataset):
         if poses.pieces_folder is None:
             return None
         settings = (poses.piece_poses, poses.sampled_size, poses.seed, piece.of.most)
-        text = f"{piece.identity} {piece.of.seed} {piece.number} {settings}"
+        text = f"{PIECE_FORMAT} {piece.identity} {piece.of.seed} {piece.number} {settings}"
         digest = hashlib.sha256(text.encode()).hexdigest()[:24]
         return Path(poses.pieces_folder) / f"{digest}.safetensors"
 
@@ -235,8 +255,14 @@ def cut_scenes(
     return found
 
 
-def write_piece(path: Path, cameras: Cameras, images: Tensor) -> None:
-    """Write a piece's cameras (C,) and renders (C, H, W, 4) uint8 to a file."""
+def _bytes(image: Tensor) -> Tensor:
+    """An image in [0, 1] as bytes, on the CPU."""
+    return (255 * image.clamp(0, 1)).round().to(torch.uint8).cpu()
+
+
+def write_piece(path: Path, renders: PieceRenders) -> None:
+    """Write a piece's cameras and renders to a file."""
+    cameras, images, behind = renders
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = cameras.metadata or {}
     tensors = {
@@ -248,6 +274,7 @@ def write_piece(path: Path, cameras: Cameras, images: Tensor) -> None:
         "near_plane": metadata["near_plane"],
         "eps2d": metadata["eps2d"],
         "images": images,
+        "behind": behind,
     }
     write_tensors(
         path,
@@ -256,7 +283,7 @@ def write_piece(path: Path, cameras: Cameras, images: Tensor) -> None:
     )
 
 
-def read_piece(path: Path) -> tuple[Cameras, Tensor] | None:
+def read_piece(path: Path) -> PieceRenders | None:
     """Cameras and renders of a piece's file; None if it is not usable, so that it is made again."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -266,6 +293,8 @@ def read_piece(path: Path) -> tuple[Cameras, Tensor] | None:
         images = found["images"]
         count, height, width, _ = images.shape
         fits = images.dtype == torch.uint8 and images.shape[3] == 4 and count > 0
+        fits = fits and found["behind"].dtype == torch.uint8
+        fits = fits and found["behind"].shape == (count, height, width, 3)
         fits = fits and found["camera_to_worlds"].shape == (count, 3, 4)
         numbers = ("fx", "fy", "cx", "cy", "near_plane", "eps2d")
         fits = fits and all(found[name].shape == (count, 1) for name in numbers)
@@ -287,4 +316,4 @@ def read_piece(path: Path) -> tuple[Cameras, Tensor] | None:
         )
     except (SafetensorError, OSError, KeyError, ValueError, RuntimeError):
         return None
-    return cameras, images
+    return PieceRenders(cameras, images, found["behind"])

@@ -194,7 +194,9 @@ class PointSplatPipeline(VanillaPipeline):
         summary = evaluation.summarize(reports, get_std)
         config = self.config.model
         pruning = dataclasses.asdict(config.prune_settings())
-        summary["settings"] = {"size": config.size, **network_options(vars(config)), **pruning}
+        by_units = {name: getattr(model.refiner.config, name) for name in ("norm", "means_reach")}
+        options = network_options(vars(config)) | by_units
+        summary["settings"] = {"size": config.size, **options, **pruning}
         summary["supervision"] = manager.supervision
         if lpips.reason is not None:
             summary["lpips_note"] = lpips.reason

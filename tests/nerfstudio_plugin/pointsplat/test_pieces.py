@@ -69,7 +69,8 @@ def test_a_training_on_pieces_keeps_them_and_saves_whole_scenes(
     trainer, losses = run_training(config)
     assert len(losses) == 2 and all(map(torch.tensor, losses))
     kept = list((tmp_path / "kept").iterdir())
-    assert kept and read_piece(kept[0])[1].shape == (2, 36, 48, 4)
+    found = read_piece(kept[0])
+    assert (found.images.shape, found.behind.shape) == ((2, 36, 48, 4), (2, 36, 48, 3))
     manager = trainer.pipeline.datamanager
     assert {s.identity for s in manager.scenes[:3]} == trainer.pipeline.trained_on
     summary = trainer.pipeline.get_average_eval_image_metrics()
@@ -85,24 +86,31 @@ def test_a_training_on_pieces_keeps_them_and_saves_whole_scenes(
 def test_a_damaged_file_of_a_piece_is_made_again(three_rooms, tmp_path):
     manager = manager_of(three_rooms, pieces_folder=tmp_path)
     piece = manager.scenes[3]
-    images = piece.rendered["train"].dataset._content()[1]
+    images = piece.rendered["train"].dataset._content().images
     (path,) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:-100])
     assert read_piece(path) is None
     again = manager_of(three_rooms, pieces_folder=tmp_path).scenes[3]
-    assert torch.equal(again.rendered["train"].dataset._content()[1], images)
+    assert torch.equal(again.rendered["train"].dataset._content().images, images)
     assert read_piece(path) is not None
 
 
-def test_renders_of_a_piece_are_composited_over_any_background(three_rooms):
+def test_a_piece_over_the_rest_of_its_scene_and_over_any_colour(three_rooms):
     piece = manager_of(three_rooms).scenes[3]
     camera, data = piece.rendered["train"][0]
     image = data["image"].float() / 255
+
+    def drawn(scene: Gaussians, background: torch.Tensor) -> torch.Tensor:
+        return render(scene, views_of_cameras(camera, background)[0])
+
     white = torch.ones(3)
-    drawn = render(piece.read_dense(), views_of_cameras(camera, white)[0])
     composited = image[..., :3] * image[..., 3:] + 1 - image[..., 3:]
     # colour and opacity are each rounded to 1/255
-    assert (drawn - composited).abs().max() < 1.5 / 255
+    assert (drawn(piece.read_dense(), white) - composited).abs().max() < 1.5 / 255
+    rest = piece.of.rest(piece.number)
+    assert len(rest) == 900 - len(piece.read_dense())
+    behind = piece.training_background(data)
+    assert (drawn(rest, torch.zeros(3)) - behind).abs().max() <= 0.51 / 255
 
 
 def test_what_is_not_seen_is_left_out_in_one_line_and_what_is_small_stays_whole(tmp_path):
