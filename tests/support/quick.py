@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-
-import pytest
+from unittest import mock
 
 from pointsplat_ns.pipeline import view_provider
 from pointsplat_ns.pipeline.repair_budget import STEPS
@@ -23,7 +22,7 @@ RESOLUTION = (64, 48)
 def quick_settings() -> Iterator[None]:
     """Within, views are chosen from few candidates and small, and ``--effort quick`` takes no
     steps."""
-    with use_settings(QUICK), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view_provider, "RESOLUTION", RESOLUTION)
-        patch.setitem(STEPS, "quick", 0)
+    small = mock.patch.object(view_provider, "RESOLUTION", RESOLUTION)
+    unrepaired = mock.patch.dict(STEPS, {"quick": 0})
+    with use_settings(QUICK), small, unrepaired:
         yield
