@@ -187,7 +187,7 @@ def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(
         stage.scene.device for stage in found.stages
     } == {room.device}
     for ours, right in zip(found.stages, wanted.stages, strict=True):
-        assert ours.name == right.name and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
+        assert ours.stage == right.stage and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
 
 
 @pytest.mark.parametrize("method", ["splatfacto-cpu", "pointsplat"])

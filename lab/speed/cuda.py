@@ -35,7 +35,7 @@ from lab.common.timing import seconds_of
 from lab.rooms import write_room
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rendering import rasterization
-from pointsplat_ns.rendering.rasterization import gsplat_works
+from pointsplat_ns.rendering.rasterize import gsplat_works
 from pointsplat_ns.system.threads import now
 
 SUPPORT = Path(__file__).parents[2] / "tests" / "support"

@@ -14,7 +14,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl, viewmats_to_opengl
 from pointsplat_ns.rendering import rasterization
-from pointsplat_ns.rendering.rasterization import use_gsplat
+from pointsplat_ns.rendering.rasterize import use_gsplat
 from pointsplat_ns.scene.views import EPS2D, NEAR_PLANE, RasterizeMode, Views
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.tensors import DOUBLES
@@ -53,7 +53,7 @@ class RasterizerOptions:
         return f"rasterizer: {slow if why else 'compiled'}"
 
     def rasterize(self, training: bool, **arguments) -> tuple[Tensor, Tensor, dict]:
-        """:func:`~pointsplat_ns.rendering.rasterization` with these options; exact outside of
+        """:func:`~pointsplat_ns.rendering.rasterize` with these options; exact outside of
         training."""
         quality = self.quality if training else "exact"
         return rasterization(

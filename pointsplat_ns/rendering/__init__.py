@@ -1,6 +1,6 @@
 """A differentiable rasterizer of 3D Gaussians in plain torch, with gsplat's interface."""
 
-from pointsplat_ns.rendering.rasterization import rasterization
+from pointsplat_ns.rendering.rasterize import rasterization
 from pointsplat_ns.rendering.render_scene import (
     pixel_sums,
     pixels_of,

@@ -1,4 +1,4 @@
-"""Checks arguments of :func:`~pointsplat_ns.rendering.rasterization.rasterization`.
+"""Checks arguments of :func:`~pointsplat_ns.rendering.rasterize.rasterization`.
 
 Values of tensors are not checked.
 """

@@ -12,7 +12,7 @@ from torch import Tensor
 from pointsplat_ns.rendering import whole_pictures as pictures
 from pointsplat_ns.rendering.constants import ALPHA_MIN, QUALITIES
 from pointsplat_ns.rendering.projection import camera_to, drawn_antialiased
-from pointsplat_ns.rendering.rasterization import Colors, QualityName, rasterization
+from pointsplat_ns.rendering.rasterize import Colors, QualityName, rasterization
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system.threads import one_thread_each

@@ -50,7 +50,7 @@ def here(tmp_path, monkeypatch):
         (
             "model/cameras.bin",
             ("prune", *ROOM, "--poses", "model", "--keep", "auto"),
-            "model: a folder without",
+            "model: no cameras.bin or cameras.txt",
         ),
         (
             "a.safetensors",

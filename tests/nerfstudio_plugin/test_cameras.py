@@ -286,7 +286,7 @@ def test_a_photo_that_its_exif_turns_is_said(tmp_path, orientation, hint):
     exif = Image.Exif()
     exif[274] = orientation
     Image.new("RGB", (HEIGHT, WIDTH)).save(dataset.image_filenames[2], exif=exif)
-    with pytest.raises(DataError, match=f"photo2.png: .* pixels, but its camera is for .*{hint}"):
+    with pytest.raises(DataError, match=f"photo2.png: .* pixels, but its camera says .*{hint}"):
         Frames(dataset)[2]
 
 

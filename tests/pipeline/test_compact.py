@@ -118,7 +118,7 @@ def test_what_is_not_finite_never_gets_out(scene, views):
     assert not result.accepted and same(result.scene, pruned)
 
     class Unsound(Refiner):
-        def forward(self, scene, structure=None):
+        def forward(self, scene, structure=None, kept=None):
             means = scene.means.clone()
             means[:7] = math.nan
             return scene.replace(means=means)

@@ -30,7 +30,7 @@ def draw(scene, **options):
 
 
 def test_every_gradient_of_the_package_is_once_differentiable():
-    for part in ("rasterizer", "refiner", "metrics"):
+    for part in ("rendering", "refinement", "metrics"):
         package = importlib.import_module(f"pointsplat_ns.{part}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
@@ -92,7 +92,7 @@ def test_gsplat_gets_cameras_of_the_gaussians_type(monkeypatch):
         given.update(means=means.dtype, viewmats=viewmats.dtype, Ks=Ks.dtype)
 
     monkeypatch.setattr(gsplat.rendering, "rasterization", positional)
-    monkeypatch.setattr("pointsplat_ns.rendering.rasterization.use_gsplat", lambda *_: True)
+    monkeypatch.setattr("pointsplat_ns.rendering.rasterize.use_gsplat", lambda *_: True)
     eyes = torch.eye(4, dtype=torch.float64)[None], torch.eye(3, dtype=torch.float64)[None]
     rasterization(*make_scene(5), *eyes, WIDTH, HEIGHT, sh_degree=3, backend="gsplat")
     assert given == dict.fromkeys(given, torch.float32) and len(given) == 3

@@ -10,7 +10,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import box_room, move_zero_layers
-from pointsplat_ns.pipeline import repair
+from pointsplat_ns.pipeline import repair_budget
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refinement import Refiner, preset, save_refiner
 from pointsplat_ns.system.threads import fixed_threads
@@ -90,7 +90,7 @@ def test_the_api_gives_the_same_bits_whatever_torchs_settings(tmp_path, monkeypa
     torch.manual_seed(0)
     refiner = move_zero_layers(Refiner(preset("tiny", sh_degree=1)))
     save_refiner(refiner, tmp_path / "refiner.safetensors", {"keep": 0.2})
-    monkeypatch.setitem(repair.STEPS, "quick", 4)
+    monkeypatch.setitem(repair_budget.STEPS, "quick", 4)
     for name in ("usual", "changed"):
         (tmp_path / name).mkdir()
     wanted = results_of(tmp_path / "scene.ply", tmp_path / "usual")

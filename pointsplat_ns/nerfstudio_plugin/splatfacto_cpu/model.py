@@ -41,7 +41,7 @@ from pointsplat_ns.nerfstudio_plugin.cameras import (
     need_pinhole,
 )
 from pointsplat_ns.nerfstudio_plugin.console import log
-from pointsplat_ns.rendering.rasterization import Colors
+from pointsplat_ns.rendering.rasterize import Colors
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 

@@ -72,7 +72,7 @@ DATA = "pipeline.datamanager"
         (f"{MODEL}.ssim_lambda", NAN, "a finite number from 0 to 1"),
         (f"{MODEL}.collider_params", {"near_plane": NAN}, "a finite number"),
         (f"{DATA}.cache_gigabytes", -1.0, "a finite number, 0 or more"),
-        (f"{DATA}.camera_res_scale_factor", 1e-9, "photos of 0 pixels"),
+        (f"{DATA}.camera_res_scale_factor", 1e-9, "0 x 0 pixels"),
         (f"{DATA}.dataparser.train_split_fraction", 0.0, "from 0 to 1, not 0"),
         (f"{DATA}.dataparser.eval_interval", 0, "2 or more"),
         ("optimizers.means.optimizer.lr", NAN, "a finite number, 0 or more"),
