@@ -114,7 +114,7 @@ def test_scenes_are_known_by_name_and_the_first_held_out_is_the_default(
 def test_the_refiner_alone_needs_no_scenes(make_refined_run, tmp_path):
     run = make_refined_run(tmp_path, Path("/not/on/this/machine"))
     assert load_refiner(run).settings == PruneSettings(0.5, "paper")
-    with pytest.raises(SceneError, match="config.yml: its data .*is not there"):
+    with pytest.raises(SceneError, match="config.yml: its data .*is missing"):
         open_refiner_run(run, need_data=True)
 
 

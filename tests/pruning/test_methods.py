@@ -81,7 +81,7 @@ def test_progress_rises_to_one(by):
 
 @pytest.mark.parametrize("by", WITHOUT_VIEWS)
 def test_a_scene_with_no_gaussian_or_none_that_can_be_drawn_is_refused(by):
-    with pytest.raises(BudgetError, match="holds no Gaussians"):
+    with pytest.raises(BudgetError, match="has no Gaussians"):
         prune(Gaussians.empty(), 0.5, by)
     with pytest.raises(SceneError, match="none of the 60 Gaussians can be drawn"):
         prune(normal_scene(60, 1).map(lambda value: value * math.nan), 5, by)
@@ -163,7 +163,7 @@ def test_a_float_is_a_ratio_and_an_int_is_a_count(n, keep, k):
         ),
         *((1000, keep, f"keep is {keep} Gaussians; expected at least 1") for keep in (0, -1)),
         (1000, Megabytes(1e-6), "keep is 1e-06MB, too small for one Gaussian"),
-        *((0, keep, "holds no Gaussians") for keep in (1, 0.5, Megabytes(1.0))),
+        *((0, keep, "has no Gaussians") for keep in (1, 0.5, Megabytes(1.0))),
         (1000, WithinPsnr(35.0), "needs rendering"),
         (1000, Megabytes(1.0, ".sog"), "needs writing"),
     ],
