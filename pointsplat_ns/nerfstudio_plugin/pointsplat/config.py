@@ -35,6 +35,7 @@ from pointsplat_ns.system.processes import (
     rank,
     torchrun_rank,
 )
+from pointsplat_ns.system.terminal import say
 
 REFINER_RATES = {
     "encoder": 1e-4,
@@ -139,7 +140,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     def print_to_terminal(self) -> None:
         """As nerfstudio's, by the first process; before, how scenes are pruned."""
         if rank() == 0:
-            print(selection_text(self.model_config.prune_settings()), flush=True)
+            say(selection_text(self.model_config.prune_settings()), flush=True)
             super().print_to_terminal()
 
     def save_config(self) -> None:

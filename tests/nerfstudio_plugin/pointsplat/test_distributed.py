@@ -120,7 +120,7 @@ def work(rank: int, folder: Path, port: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def together(tmp_path_factory):
+def together(tmp_path_factory, quick):
     """What the two processes found, and what one process finds with two scenes an update."""
     folder = tmp_path_factory.mktemp("parallel")
     (folder / "rooms").mkdir()
