@@ -84,7 +84,7 @@ def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
             ("compact", "rooms", "--poses", "a.json"),
             "--poses is for one scene; rooms is a folder of scenes",
         ),
-        (("compact", "rooms", "-o", "rooms"), "rooms: holds the scenes themselves"),
+        (("compact", "rooms", "-o", "rooms"), "rooms: contains the scenes themselves"),
         (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs is for a folder"),
         (("compact", "empty"), "empty: no scene below it"),
         (("convert", "rooms", "out"), "compact and info take a folder of scenes"),

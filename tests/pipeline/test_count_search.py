@@ -10,9 +10,9 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.pipeline.budget_search import (
     SLOPE,
     FileLimit,
-    few_psnr,
     find_count,
     largest_within,
+    psnr_for_rounding,
     smallest_within,
 )
 from pointsplat_ns.pipeline.options import PruneOptions
@@ -187,7 +187,9 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
     }
     assert len(found[25.0][0]) > 1.1 * len(found[35.0][0])
     for half, (scene, rounded, _) in found.items():
-        wanted = rounding_for(few_psnr(psnr_of(half, scene), len(scene) / 4000), full.sh_degree)
+        wanted = rounding_for(
+            psnr_for_rounding(psnr_of(half, scene), len(scene) / 4000), full.sh_degree
+        )
         assert rounded.rounding == pytest.approx(wanted)
         small = rounded.rounded(scene)
         assert len(small) == len(scene) and 0.9 * 32_000 < rounded.bytes_of(small) <= 32_000
@@ -198,8 +200,8 @@ def test_the_psnr_of_rounding_falls_by_the_slope_at_any_share(kept):
     """If the error of merging is A (kept^-p - 1), rounding goes by A kept^-p."""
     power = 10 ** (-SLOPE * math.log(kept) / 10)
     merged = 40 - 10 * math.log10(power - 1)
-    assert few_psnr(merged, kept) == pytest.approx(40 + SLOPE * math.log(kept), abs=1e-5)
-    assert few_psnr(merged, kept) < merged or kept < 1e-3
+    assert psnr_for_rounding(merged, kept) == pytest.approx(40 + SLOPE * math.log(kept), abs=1e-5)
+    assert psnr_for_rounding(merged, kept) < merged or kept < 1e-3
 
 
 def test_a_scene_is_rounded_as_far_as_its_size_needs():
