@@ -39,7 +39,7 @@ def test_clean_writes_what_the_function_returns_and_a_picture(room, capsys):
     )
     assert (
         picture.read_bytes()[:4] == b"\x89PNG"
-        and f"{picture}: the scene, what goes, and the result" in said
+        and f"{picture}: the scene, the removed Gaussians and the result" in said
     )
 
 

@@ -75,8 +75,8 @@ def in_frame(
         search.background = 0.0
     if not _fits(found):
         raise DataError(
-            f"{model}: renders of the scene do not match the photos, in the frame of these poses or "
-            f"in another tried frame ({given.psnr:.1f} dB PSNR in {given.count} photos, "
+            f"{model}: renders of the scene do not match the photos in the frame of these poses or "
+            f"in any other tried ({given.psnr:.1f} dB PSNR in {given.count} photos, "
             f"correlation {given.own:.2f}; at best {found.psnr:.1f} dB and {found.own:.2f}); "
             "expected the poses and photos of the scene's training, in its frame: put the "
             "dataparser_transforms.json of its run beside the scene, or name other poses (--poses)"

@@ -151,7 +151,7 @@ def test_photos_of_another_scene_are_refused_with_their_psnr(scene, views, tmp_p
     folder = write_photos(other.replace(features_dc=colors), views, tmp_path / "images")
     write_sparse(views, tmp_path / "sparse/0")
     with pytest.raises(
-        DataError, match=r"unlike the photos in the frame .* dB PSNR in 8 photos.*--poses"
+        DataError, match=r"do not match the photos in the frame .* dB PSNR in 8 photos.*--poses"
     ):
         read(scene, folder)
 
