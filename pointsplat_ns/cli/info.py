@@ -108,10 +108,8 @@ def _print(found: SceneInfo) -> None:
     from pointsplat_ns.system.files import bytes_text
 
     say(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
-    say(
-        f"{found.gaussians:,} Gaussians of SH degree "
-        f"{found.sh_degree}{', antialiased' if found.antialiased else ''}"
-    )
+    training = ", antialiased" if found.antialiased else ""
+    say(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}{training}")
     if found.offset:
         say(f"positions are relative to {' '.join(map(repr, found.offset))}")
     say(f"up: {found.up_text}{'; --up sets another axis' if found.up_is_guess else ''}")

@@ -99,8 +99,8 @@ def run_frame(run: Run) -> Similarity:
     off = (matrix @ matrix.T - torch.eye(3, **FLOATS)).abs().max()
     if not size > 0 or float(off) > 1e-4:  # saved with about 7 digits
         raise SceneError(
-            f"{run.folder}: its transform is not a rotation with one scale; expected the file "
-            "that nerfstudio saved"
+            f"{run.folder}: its transform is not a rotation with one scale; expected the file that "
+            "nerfstudio saved"
         )
     u, _, v = torch.linalg.svd(matrix)
     return Similarity(u @ v, size * run.scale, run.transform[:, 3].double() * run.scale)

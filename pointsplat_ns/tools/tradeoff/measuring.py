@@ -120,10 +120,8 @@ class Measurer:
         self.judged, self.note = views_to_judge(subject, views)
         shown = self.judged.views
         if min(shown.width, shown.height) < SSIM_WINDOW:
-            raise DataError(
-                f"views are {shown.width} x {shown.height} pixels; expected at least "
-                f"{SSIM_WINDOW} per side"
-            )
+            size = f"{shown.width} x {shown.height} pixels"
+            raise DataError(f"views are {size}; expected at least {SSIM_WINDOW} per side")
 
     def point(self, setting: Setting, scene: Gaussians, seconds: float, show: Progress) -> Point:
         """Measure the point of a setting, from its scene and the duration of making it. The dense
