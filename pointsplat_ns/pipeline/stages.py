@@ -72,7 +72,9 @@ class Refine:
         if context.comparison is None or last.after is None:
             reason = Reason(Cause.NOT_COMPARED, error=context.uncompared)
             return StageResult("refine", refined, None, reason=reason)
-        after, rejection = context.comparison.judge(last.after, last.scene, refined, context.progress)
+        after, rejection = context.comparison.judge(
+            last.after, last.scene, refined, context.progress
+        )
         return StageResult("refine", refined, after, before=last.after, reason=rejection)
 
 
