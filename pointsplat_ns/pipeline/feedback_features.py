@@ -13,7 +13,7 @@ from torch import Tensor
 from pointsplat_ns.pipeline.optimiser import Adam, AdamSettings, Choose
 from pointsplat_ns.scene.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.system.pieces import pieces
-from pointsplat_ns.system.threads import one_thread_each
+from pointsplat_ns.system.threads import one_thread_each, parallel_for
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from pointsplat_ns.system.kernels import (
     on_threads,
 )
 from pointsplat_ns.system.tensors import DOUBLES
-from pointsplat_ns.system.threads import most_threads, one_thread, one_thread_each
+from pointsplat_ns.system.threads import most_threads, one_thread, one_thread_each, parallel_map
 
 
 class AdamStepStruct(Struct):
