@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import sys
 from dataclasses import dataclass, field
 from typing import Literal, cast
 
@@ -58,6 +57,10 @@ class SilentWriter(LocalWriter):
 
     def write_stats_log(self, step: int) -> None:
         """Print nothing."""
+
+
+ENDLESS = 1 << 40
+"""A number of steps that no time allows; with more added to it, tensorboard can count to it."""
 
 
 @dataclass
@@ -156,7 +159,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         """
         config = copy.deepcopy(self)
         if config.seconds is not None:
-            config.max_num_iterations = sys.maxsize
+            config.max_num_iterations = ENDLESS
         for group in config.optimizers.values():
             group["optimizer"].lr *= self.rate_factor
             if self.global_norm is not None:

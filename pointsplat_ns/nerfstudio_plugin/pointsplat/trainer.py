@@ -76,6 +76,7 @@ class PointSplatTrainer(StoppableTrainer):
     pipeline: PointSplatPipeline
     clock = staticmethod(time.monotonic)
     """Seconds since any moment."""
+    stop_training = False  # nerfstudio sets it in train()
     _last_step = sys.maxsize
 
     def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:

@@ -185,6 +185,9 @@ def test_each_process_evaluates_its_share_and_the_first_alone_writes(together):
         "config.yml",
         "refiner.safetensors",
         f"step-{UPDATES - 1:09d}.ckpt",
+        "training.csv",
+        "training.png",
+        "views.png",
     ]
     assert found[1]["files"] == []
 
