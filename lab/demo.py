@@ -70,8 +70,8 @@ def demo(output: Path = Path("outputs/demo")) -> None:
     rows += train_and_judge(output)
     show_results(rows)
     print(
-        "So few steps show the commands. A refiner that gains takes hours: "
-        "docs/guides/own_refiner.md."
+        "pruned -> refined is one pass of the network that ships, tuned on this scene. For one of "
+        "your own scenes: docs/guides/own_refiner.md."
     )
     print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes; everything is in {output}")
 
@@ -154,16 +154,16 @@ def train_and_judge(output: Path) -> list[Row]:
         logs / "train_scene.txt",
     )
     run(
-        "Merge the scene to 30 % of its Gaussians, and train a refiner to undo the loss, "
-        f"{DEMO.refiner_steps} steps.",
+        "Keep 30 % of its Gaussians by PointSplat's score, and tune the network that ships on "
+        f"this scene, {DEMO.refiner_steps} steps.",
         ["ns-train", METHOD_NAMES.refiner, "--output-dir", refined.parents[2], *common]
         + [
             "--max-num-iterations",
             DEMO.refiner_steps,
             "--data",
             scenes,
-            "--pipeline.model.size",
-            "tiny",
+            "--init",
+            "shipped",
         ]
         + ["--pipeline.model.lpips-weight", 0],
         logs / "train_refiner.txt",

@@ -158,29 +158,3 @@ def test_a_damaged_checkpoint_is_refused(make_refined_run, tmp_path):
     torch.save({"step": 9, "pipeline": {}}, checkpoint)
     with pytest.raises(SceneError, match="step-000000009.ckpt: not a usable pointsplat checkpoint"):
         load_refiner(run)
-
-
-@pytest.mark.parametrize("by", ["paper", "opacity"])
-def test_the_network_that_ships_for_selections_brings_a_room_closer_that_it_never_saw(by):
-    refiner = load_refiner("shipped", "cpu", by=by)
-    assert refiner.settings.by == "paper" and refiner.network.config.units == "local"
-    assert refiner.source.stat().st_size <= 10e6
-    room = ps.example_room()
-    views = ps.sample_views(room, 4, width=160, height=120)
-    renders = [ps.render(room, view) for view in views]
-
-    def psnr(scene: ps.Gaussians) -> float:
-        each = [
-            ps.psnr(ps.render(scene, view), image)
-            for view, image in zip(views, renders, strict=True)
-        ]
-        return float(torch.stack(each).mean())
-
-    small = prune(room, 0.1, by)
-    # 2 to 3 dB were measured
-    assert psnr(ps.refine(small, refiner, kept=0.1)) > psnr(small) + 1.0
-
-
-def test_the_network_that_ships_for_merging_is_another():
-    assert load_refiner("shipped", "cpu").settings.by == "merge"
-    assert load_refiner(None, "cpu", by="merge").network.config.units == "scene"
