@@ -184,3 +184,10 @@ def test_the_network_that_ships_for_selections_brings_a_room_closer_that_it_neve
 def test_the_network_that_ships_for_merging_is_another():
     assert load_refiner("shipped", "cpu").settings.by == "merge"
     assert load_refiner(None, "cpu", by="merge").network.config.units == "scene"
+
+
+def test_a_trained_refiner_prints_as_one_line_with_its_network_and_selection():
+    loaded = load_refiner(device="cpu")
+    text = repr(loaded)
+    assert "\n" not in text and len(text) < 140
+    assert all(part in text for part in (repr(loaded.network), "tiny", "cpu", "merge", "0.1"))
