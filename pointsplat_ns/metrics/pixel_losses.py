@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 from pointsplat_ns.metrics.images import as_nchw
@@ -47,6 +46,7 @@ def l1_loss(pred: Tensor, target: Tensor) -> Tensor:
         ImageError: if the images cannot be compared.
 
     Example:
+        >>> import torch
         >>> import pointsplat_ns as ps
         >>> image = torch.full((4, 4, 3), 0.75, requires_grad=True)
         >>> ps.l1_loss(image, torch.full((4, 4, 3), 0.5)).item()
@@ -70,6 +70,7 @@ def rmse_loss(pred: Tensor, target: Tensor) -> Tensor:
         ImageError: if the images cannot be compared.
 
     Example:
+        >>> import torch
         >>> import pointsplat_ns as ps
         >>> loss = ps.rmse_loss(torch.full((4, 4, 3), 0.75), torch.full((4, 4, 3), 0.5))
         >>> round(loss.item(), 4)
