@@ -40,10 +40,13 @@ if TYPE_CHECKING:
         PointSplatError,
         SceneError,
     )
-    from pointsplat_ns.metrics import psnr, ssim
+    from pointsplat_ns.metrics import l1_loss, psnr, rmse_loss, ssim
     from pointsplat_ns.metrics.lpips import lpips
-    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views, run_photos
     from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner, load_refiner, refine
+    from pointsplat_ns.pruning.paper import paper_score, select
+    from pointsplat_ns.refinement.config import RefinerConfig, refiner_preset
+    from pointsplat_ns.refinement.refiner import Refiner
     from pointsplat_ns.rendering import rasterization, render
     from pointsplat_ns.scene.gaussians import Gaussians
     from pointsplat_ns.scene.reading import save
@@ -89,9 +92,12 @@ _PUBLIC = {
     "pointsplat_ns.scene.gaussians": ("Gaussians",),
     "pointsplat_ns.scene.reading": ("save",),
     "pointsplat_ns.tools.filming": ("open_viewer", "render_path"),
-    "pointsplat_ns.metrics": ("psnr", "ssim"),
+    "pointsplat_ns.metrics": ("l1_loss", "psnr", "rmse_loss", "ssim"),
     "pointsplat_ns.metrics.lpips": ("lpips",),
-    "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
+    "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views", "run_photos"),
+    "pointsplat_ns.pruning.paper": ("paper_score", "select"),
+    "pointsplat_ns.refinement.config": ("RefinerConfig", "refiner_preset"),
+    "pointsplat_ns.refinement.refiner": ("Refiner",),
     "pointsplat_ns.tools.tradeoff.measure_table": ("measure_tradeoff",),
     "pointsplat_ns.rendering": ("rasterization", "render"),
     "pointsplat_ns.tools.tradeoff.points": ("Tradeoff",),
@@ -109,6 +115,8 @@ __all__ = [
     "Levels",
     "MissingPackageError",
     "PointSplatError",
+    "Refiner",
+    "RefinerConfig",
     "SceneError",
     "SceneInfo",
     "SceneResult",
@@ -122,12 +130,14 @@ __all__ = [
     "dataset_views",
     "example_room",
     "info",
+    "l1_loss",
     "load",
     "load_refiner",
     "lod",
     "lpips",
     "measure_tradeoff",
     "open_viewer",
+    "paper_score",
     "place",
     "plot_comparison",
     "plot_views",
@@ -135,10 +145,14 @@ __all__ = [
     "psnr",
     "rasterization",
     "refine",
+    "refiner_preset",
     "render",
     "render_path",
+    "rmse_loss",
+    "run_photos",
     "sample_views",
     "save",
+    "select",
     "ssim",
     "write_page",
 ]

@@ -10,7 +10,7 @@ from pointsplat_ns.metrics.images import (
     psnr_of,
     ssim,
 )
-from pointsplat_ns.metrics.pixel_losses import PIXEL_LOSSES, PixelLoss
+from pointsplat_ns.metrics.pixel_losses import PIXEL_LOSSES, PixelLoss, l1_loss, rmse_loss
 from pointsplat_ns.metrics.structural_similarity import SSIM_WINDOW
 
 __all__ = [
@@ -21,8 +21,10 @@ __all__ = [
     "PixelLoss",
     "as_nchw",
     "finite_psnr",
+    "l1_loss",
     "per_image",
     "psnr",
     "psnr_of",
+    "rmse_loss",
     "ssim",
 ]

@@ -50,9 +50,35 @@ def dataset_views(
 
 
 def run_photos(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Photos:
-    """The photos of a split of a run's dataset, read when they are asked for. Arguments and errors
-    are those of :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked
-    for."""
+    """The photos of a run's dataset with their poses, in the frame and at the resolution that the
+    run was trained in.
+
+    A photo is read when it is asked for: ``view, target, mask = photos[0]`` gives its
+    :class:`~pointsplat_ns.scene.views.View`, the photo (H, W, 3), in [0, 1] or uint8, and the
+    pixels that count, (H, W, 1) bool or None for all. A photo that cannot be used raises a
+    DataError then. Needs nerfstudio, which takes a few seconds to import.
+
+    Args:
+        path: the run's folder, ``config.yml`` or checkpoint.
+        split: "train" for the training photos, "test" for the held-out photos.
+        data: where the run's data is now, if it moved: the data itself, or a folder above it.
+
+    Returns:
+        A sequence of C photos with views on the CPU.
+
+    Raises:
+        SceneError: if ``path`` is not a run, or the run's data is missing.
+        DataError: if the poses are not usable, the split has none, nerfstudio is not installed, or
+            the training fitted colours to each of its photos, which renders do not have.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> ps.run_photos("outputs/no_run")
+        Traceback (most recent call last):
+        ...
+        pointsplat_ns.errors.SceneError: outputs/no_run: no such file or folder; expected a
+        nerfstudio run
+    """
     scene = _scene_at(path, data)
     if split == "train":
         scene.need_photos_as_rendered("leave the photos out")

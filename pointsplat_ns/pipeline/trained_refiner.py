@@ -42,6 +42,9 @@ class TrainedRefiner:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of ``ns-train pointsplat`` that the network was built with, as far as recorded."""
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.network}, for {self.settings.by} {self.settings.keep})"
+
     @torch.no_grad()
     def __call__(self, scene: Gaussians, kept: float | None = None) -> Gaussians:
         """The refined scene, on the device of the given one.
@@ -61,7 +64,7 @@ class TrainedRefiner:
     @property
     def device(self) -> torch.device:
         """Device of the network."""
-        return next(self.network.parameters()).device
+        return self.network.device
 
 
 def load_refiner(

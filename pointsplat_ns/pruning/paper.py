@@ -39,6 +39,13 @@ def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT
 
     Raises:
         ScoreError: if ``opacity_weight`` is not in [0, 1].
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> scene = ps.example_room()
+        >>> pruned = scene[ps.select(ps.paper_score(scene), 1000)]
+        >>> pruned.means.equal(ps.prune(scene, keep=1000, by="paper").means)
+        True
     """
     return weighted_score(
         scene,
@@ -102,13 +109,24 @@ def of_usable(scene: Gaussians, score: Callable[[Gaussians], Tensor]) -> Tensor:
 
 
 def select(scores: Tensor, k: int) -> Tensor:
-    """Indices (k,) int64, ascending, of the ``k`` highest scores (N,), of any floating type, +-Inf
-    allowed.
+    """Select the Gaussians with the highest scores.
 
     Of equal scores, lower indices come first; NaN ranks below every number.
 
+    Args:
+        scores: (N,), of any floating type, +-Inf allowed.
+        k: number of Gaussians to keep.
+
+    Returns:
+        Indices (k,), int64, ascending.
+
     Raises:
         BudgetError: if ``k`` is not in 0..N.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> ps.select(torch.tensor([0.5, 2.0, 1.0]), 2)
+        tensor([1, 2])
     """
     n = scores.shape[0]
     if not 0 <= k <= n:

@@ -18,6 +18,20 @@ _NAMES = {
     "curves": ("z", "z-trans", "hilbert", "hilbert-trans"),
 }
 
+_LAYERS = (
+    "enc_channels",
+    "enc_depths",
+    "enc_heads",
+    "dec_channels",
+    "dec_depths",
+    "dec_heads",
+    "mlp_ratio",
+    "feature_dim",
+    "head_width",
+    "head_depth",
+)
+"""Fields that make the size of a network."""
+
 _RANGES = {
     "sh_degree": (0, MAX_SH_DEGREE),
     "grid": (1, 512),
@@ -38,6 +52,11 @@ class RefinerConfig:
     The defaults are the preset ``full``, the published network. Tuples of the encoder have one
     entry per stage, finest first; ``strides`` and the tuples of the decoder one fewer. Raises
     RefinerConfigError if fields contradict others.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> ps.RefinerConfig().enc_channels
+        (64, 96, 128, 256, 512)
     """
 
     sh_degree: int = MAX_SH_DEGREE
@@ -208,24 +227,43 @@ def _require(condition: bool, message: str) -> None:
         raise RefinerConfigError(message)
 
 
-def preset(name: str, **changes: Any) -> RefinerConfig:
+def refiner_preset(name: str, **changes: Any) -> RefinerConfig:
     """The configuration of a named size, with ``changes`` applied.
 
     ``full``: the published sizes, 42,762,819 parameters.
     ``small``: 2,414,339 parameters, grid adapted to the scene.
     ``tiny``: 664,563 parameters, grid adapted to the scene.
 
+    Args:
+        name: "full", "small" or "tiny".
+        changes: fields of :class:`RefinerConfig` that differ from the preset.
+
     Raises:
         RefinerConfigError: if there is no such preset, or the changes do not fit it.
 
     Example:
-        >>> preset("tiny", patch=64).patch
+        >>> import pointsplat_ns as ps
+        >>> ps.refiner_preset("tiny", patch=64).patch
         64
     """
     if name not in PRESETS:
         raise RefinerConfigError(f"no refiner size {name!r}; expected one of {', '.join(PRESETS)}")
     units = LOCAL if changes.get("units") == "local" else {}
     return RefinerConfig(**{**PRESETS[name], **units, **changes})
+
+
+preset = refiner_preset
+"""Its name within the package."""
+
+
+def preset_of(config: RefinerConfig) -> str | None:
+    """The preset whose layers a configuration has, whatever its other settings are; None if there
+    is none."""
+    for name in PRESETS:
+        layers = refiner_preset(name)
+        if all(getattr(layers, field) == getattr(config, field) for field in _LAYERS):
+            return name
+    return None
 
 
 PRESETS: dict[str, dict[str, Any]] = {

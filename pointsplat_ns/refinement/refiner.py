@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.transforms import zero_as_identity
-from pointsplat_ns.refinement.config import RefinerConfig
+from pointsplat_ns.refinement.config import RefinerConfig, preset_of
 from pointsplat_ns.refinement.local_units import (
     LocalUnits,
     local_features,
@@ -46,10 +46,9 @@ class Refiner(nn.Module):
         device: where its parameters, float32, are made; "meta" for shapes without memory.
 
     Example:
-        >>> from pointsplat_ns.refinement import Refiner, preset
-        >>> refiner = Refiner(preset("tiny")).eval()
-        >>> len(refiner(Gaussians.empty(sh_degree=3)))
-        0
+        >>> import pointsplat_ns as ps
+        >>> ps.Refiner(ps.refiner_preset("tiny"))
+        Refiner(tiny, 664,563 parameters, encoder dual, units scene, cpu)
     """
 
     def __init__(self, config: RefinerConfig, device: torch.device | str = "cpu"):
@@ -61,6 +60,14 @@ class Refiner(nn.Module):
             )
             self.backbone = PointTransformer(config.encoded_dim, config)
             self.heads = ResidualHeads(config.backbone_dim + config.encoded_dim, config)
+
+    def __repr__(self) -> str:
+        """One line, where torch would print every layer."""
+        count = sum(parameter.numel() for parameter in self.parameters())
+        return (
+            f"{type(self).__name__}({preset_of(self.config) or 'own size'}, {count:,} parameters, "
+            f"encoder {self.config.encoder}, units {self.config.units}, {self.device})"
+        )
 
     def prepare(self, scene: Gaussians) -> Structure | None:
         """Build the neighbour tables of a scene's positions, on the scene's device.
@@ -157,6 +164,11 @@ class Refiner(nn.Module):
     def dtype(self) -> torch.dtype:
         """Floating type of the network."""
         return next(self.parameters()).dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the network."""
+        return next(self.parameters()).device
 
 
 def _moved(

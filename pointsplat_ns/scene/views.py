@@ -23,7 +23,7 @@ EPS2D = 0.3
 a pixel. As in 3DGS and gsplat."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class View:
     """One pinhole camera with rendering settings: an element of :class:`Views`, which documents its
     attributes.
@@ -43,6 +43,9 @@ class View:
     rasterize_mode: RasterizeMode = "classic"
     near_plane: float = NEAR_PLANE  # scene units
     eps2d: float = EPS2D  # pixels^2
+
+    def __repr__(self) -> str:
+        return f"View({self.width} x {self.height} pixels, {self.rasterize_mode})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

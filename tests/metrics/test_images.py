@@ -7,7 +7,7 @@ import torch
 from pytorch_msssim import SSIM
 
 from making import noisy_pair as pair
-from pointsplat_ns.metrics import PIXEL_LOSSES, ImageError, psnr, psnr_of, ssim
+from pointsplat_ns.metrics import PIXEL_LOSSES, ImageError, l1_loss, psnr, psnr_of, rmse_loss, ssim
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.threads import fixed_threads
@@ -193,3 +193,21 @@ def test_losses_of_large_pictures_have_the_same_gradients_on_any_number_of_threa
                 sum(loss(difference) for loss in PIXEL_LOSSES.values()).backward()
             found.append(difference.grad)
         assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+
+
+@pytest.mark.parametrize("shape", [(6, 5, 3), (2, 6, 5, 3)])
+def test_losses_are_means_over_all_pixels_and_check_shapes(shape):
+    generator = torch.Generator().manual_seed(3)
+    a, b = torch.rand(2, *shape, generator=generator, dtype=torch.float64)
+    assert l1_loss(a, b).item() == pytest.approx(torch.nn.functional.l1_loss(a, b).item())
+    squared = torch.nn.functional.mse_loss(a, b).item()
+    assert rmse_loss(a, b).item() == pytest.approx(math.sqrt(squared), rel=1e-9)
+    for loss in (l1_loss, rmse_loss):
+        with pytest.raises(ImageError, match="expected the same"):
+            loss(a, b[..., :3, :])
+
+
+def test_the_gradient_of_rmse_is_finite_for_identical_images():
+    image = torch.full((4, 4, 3), 0.5, requires_grad=True)
+    rmse_loss(image, image.detach()).backward()
+    assert image.grad.isfinite().all()

@@ -158,3 +158,10 @@ def test_a_damaged_checkpoint_is_refused(make_refined_run, tmp_path):
     torch.save({"step": 9, "pipeline": {}}, checkpoint)
     with pytest.raises(SceneError, match="step-000000009.ckpt: not a usable pointsplat checkpoint"):
         load_refiner(run)
+
+
+def test_a_trained_refiner_prints_as_one_line_with_its_network_and_selection():
+    loaded = load_refiner(device="cpu")
+    text = repr(loaded)
+    assert "\n" not in text and len(text) < 140
+    assert all(part in text for part in (repr(loaded.network), "tiny", "cpu", "merge", "0.1"))

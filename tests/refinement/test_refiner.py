@@ -5,6 +5,8 @@ import torch
 
 from making import cloud, same, small_refiner
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.refinement import Refiner
+from pointsplat_ns.refinement.config import refiner_preset
 from pointsplat_ns.scene.gaussians import Gaussians
 
 
@@ -255,3 +257,18 @@ def test_a_structure_of_another_scene_or_configuration_is_refused():
         refiner(scene_to_refine(100), refiner.prepare(scene_to_refine(200)))
     with pytest.raises(ValueError, match="call prepare"):
         refiner(scene_to_refine(200), small_refiner(grid=32).prepare(scene_to_refine(200)))
+
+
+@pytest.mark.parametrize("name", ["tiny", "small", "full"])
+def test_a_network_prints_as_one_line_with_its_size_and_device(name):
+    config = refiner_preset(name, encoder="concat", patch=64, sh_degree=1)
+    network = Refiner(config, device="meta")
+    text = repr(network)
+    count = sum(parameter.numel() for parameter in network.parameters())
+    assert "\n" not in text and len(text) < 100
+    assert all(part in text for part in (name, f"{count:,}", "concat", "scene", "meta"))
+
+
+def test_a_network_of_other_layers_prints_no_preset():
+    text = repr(Refiner(refiner_preset("tiny", units="local", head_width=48), device="meta"))
+    assert "tiny" not in text and "local" in text and "\n" not in text

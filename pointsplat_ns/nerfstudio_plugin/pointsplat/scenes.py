@@ -253,6 +253,9 @@ class RunPhotos(Sequence[Example]):
     def __len__(self) -> int:
         return len(self._frames)
 
+    def __repr__(self) -> str:
+        return f"RunPhotos({len(self)} photos of {self._scene.name})"
+
     def __getitem__(self, index: int) -> Example:  # type: ignore[override]
         view = self._views.get(index)
         if view is None:

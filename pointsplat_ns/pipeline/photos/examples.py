@@ -26,6 +26,10 @@ class Example(NamedTuple):
     target: Tensor  # [H, W, 3] in [0, 1]
     mask: Tensor | None = None  # [H, W, 1] bool, True for valid pixels; None for all
 
+    def __repr__(self) -> str:
+        mask = "" if self.mask is None else ", masked"
+        return f"{type(self).__name__}({self.view.width} x {self.view.height} pixels{mask})"
+
     def compared(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """An image of the view, and the target on its device, both black on masked pixels."""
         target = self.target.to(image)
