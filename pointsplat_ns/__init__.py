@@ -9,7 +9,7 @@
 >>> bool(ps.psnr(image, ps.render(scene, views[0])) > 15)
 True
 
-The names below are the whole public API. They are imported when they are first used: ``import
+The names below are the whole public API. They are imported on first use, so ``import
 pointsplat_ns`` costs nothing.
 """
 
@@ -19,9 +19,8 @@ import importlib
 
 __version__ = "0.1.0"
 
-TYPE_CHECKING = (
-    False  # as type checkers read it; to import typing takes longer than all the rest here
-)
+# Not imported from typing, which takes longer than the rest of this module.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 

@@ -1,6 +1,6 @@
-"""The public functions on whole scenes; ``import pointsplat_ns as ps`` has them all.
+"""The public functions on whole scenes, available as ``import pointsplat_ns as ps``.
 
-Each command of the command line calls one of these functions.
+The commands run the same pipeline as these functions.
 """
 
 from __future__ import annotations
@@ -13,9 +13,7 @@ from pointsplat_ns.pipeline.options import CompactOptions, PruneOptions, ViewOpt
 from pointsplat_ns.pipeline.repair_budget import Effort, RepairBudget
 from pointsplat_ns.pipeline.report import Report
 from pointsplat_ns.pipeline.subject import Source, read_subject
-from pointsplat_ns.pipeline.trained_refiner import (
-    TrainedRefiner,
-)
+from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -41,7 +39,7 @@ EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
 
 
 def example_room() -> Gaussians:
-    """A small built-in scene: a room that the shipped refiner was not trained on.
+    """A small built-in scene: a room outside of the shipped refiner's training.
 
     Returns:
         The scene, float32 on the CPU, in metres with z up.
@@ -71,45 +69,46 @@ def prune(
     jobs: int | None = None,
     progress: bool | Progress = False,
 ) -> Gaussians:
-    """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are
-    needed.
+    """Make a scene smaller: merge neighbours, or keep the most important Gaussians. Needs no
+    photos.
 
-    Findings (SH bands dropped, PSNR reached, the origin of views) are logged at level INFO.
+    PSNR in held-out photos is logged at level INFO; details (cut SH bands, reached PSNR, origin of
+    views) at level DEBUG.
 
     Args:
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
         keep: size of the result: a ratio (0.3, "30%"), a count (50000), the size of a PLY ("12MB")
             or of a file of another format ("12MB.spz"), or "auto:35", the smallest scene whose
-            renders reach 35 dB PSNR against those of the given scene ("auto" alone means 35). For
-            .spz and .sog the count is searched.
-        by: the method. "merge" replaces neighbours by one Gaussian each; the others keep Gaussians
-            bit for bit: "coverage", "paper" (eq. 3), "authors", "opacity", "random", and
+            renders reach 35 dB PSNR against the given scene ("auto" alone means 35). For .spz and
+            .sog the count is searched for.
+        by: pruning method. "merge" replaces groups of neighbours by one Gaussian. The others select
+            Gaussians, bit for bit: "coverage", "paper" (eq. 3), "authors", "opacity", "random", and
             "lightgaussian" and "pup", which score Gaussians in ``views``.
-        sh: SH bands to keep: "all", up to a degree ("0" to "3"), or "auto", the lowest degree whose
-            renders reach 40 dB.
+        sh: SH bands to keep: "all", a maximum degree ("0" to "3"), or "auto", the lowest degree
+            whose renders reach 40 dB.
         opacity_weight: lambda of "paper" and "authors", in [0, 1]; by default the paper's 0.3.
-        clean: first remove Gaussians that cannot be drawn or seen; ``keep`` refers to the scene as
-            given.
-        views: cameras for all rendering: views, the run whose dataset has the poses, or a file of
-            cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a
-            COLMAP model). By default those of the run at ``scene``, or sampled poses.
-        resolution: width and height of the pictures that people look at, pixels: (1920, 1080) or
-            "1920x1080". Decisions by rendering are made at this size. By default the size of the
-            photos or of given views, else 1920 x 1080.
-        up: the axis that is up in the scene, "z" or "-y", for sampled views; by default the scene's
-            own, or estimated.
-        data: folder of the run's photos and poses, or one above it, if it is no longer where the
-            run says.
-        photos: whether to log PSNR in a run's held-out photos; or a folder of photos, with poses in
-            ``views``, or near.
-        memory: how much memory may be taken, such as "8GB" or 8000 (units of 10^6 bytes); by
-            default what is free. A PLY that needs more is merged in parts.
+        clean: first remove Gaussians that cannot be drawn or seen; ``keep`` still refers to the
+            whole scene.
+        views: cameras for all rendering: views, a run whose dataset has the poses, or a camera file
+            (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP
+            model). By default from the run at ``scene``, else from a camera file beside it, else
+            sampled.
+        resolution: width and height at which people view the scene, pixels: (1920, 1080) or
+            "1920x1080". Decisions by rendering use this size. By default the size of the photos or
+            of given views, else 1920 x 1080.
+        up: up axis of the scene, such as "z" or "-y", for sampled views; by default declared by the
+            scene, or estimated.
+        data: folder of the run's photos and poses, or a folder above it, if the data has moved.
+        photos: whether to log PSNR in the run's held-out photos; or a folder of photos, with poses
+            from ``views`` or from a camera file nearby.
+        memory: memory limit, such as "8GB" or 8000 (units of 10^6 bytes); by default the free
+            memory. A PLY that needs more is merged in parts.
         jobs: number of processes that share these parts, each within ``memory``.
         progress: True shows a bar; a function is called with the current task and the share of it
             that is done.
 
     Returns:
-        Exactly the number of Gaussians of ``keep``, on the device of the given scene.
+        The smaller scene, with exactly the requested count, on the device of the given scene.
 
     Raises:
         BudgetError: if the budget cannot be met.
@@ -169,39 +168,38 @@ def compact(
 ) -> Compacted:
     """Make a scene smaller, repair it, and accept the repair by comparing renders.
 
-    A trained refiner, if given, refines the smaller scene. Learned steps then bring it closer to
-    renders of the given scene, for the duration of ``effort`` or ``seconds``. No photos are needed.
-    A refinement or repair that harms pictures of any size is left out.
+    A trained refiner, if given, refines the smaller scene. Learned steps then repair it: they bring
+    it closer to renders of the given scene, for ``effort`` or ``seconds``. Photos are not needed. A
+    refinement or repair that harms pictures of any size is rejected.
 
     Args:
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
-        keep: size of the result, as for :func:`prune`; an "auto" PSNR is reached before repairs.
-            With ``photos``, "auto" is the smallest file that loses at most 0.3 dB in held-out
-            photos. By default the budget of the refiner's training, or a tenth without a refiner.
-        refiner: from :func:`load_refiner`; by default none.
-        by: the method, as for :func:`prune`; by default that of the refiner's training, or "merge".
+        keep: size of the result, as for :func:`prune`; pruning alone reaches an "auto" PSNR. With
+            ``photos``, "auto" is the smallest file that loses at most 0.3 dB in held-out photos. By
+            default a tenth; with a refiner the budget of its training.
+        refiner: trained network from :func:`load_refiner`; by default none.
+        by: pruning method, as for :func:`prune`; by default "merge"; with a refiner the method of
+            its training.
         sh, clean: as for :func:`prune`.
-        effort: "instant" takes no steps; "quick" and "thorough" take 192 and 1200, up to four times
-            as many for more than 20,000 Gaussians.
-        seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps
-            the scene so far.
-        photos: train on photos in place of the repair, named as for :func:`prune`, by 2400
-            ("quick") or 12000 ("thorough") steps, or for ``seconds``.
-        target_db: in place of ``keep``, least PSNR of the file, after all repairs, against the
-            given scene's renders, over the pixels that it covers, dB. The smallest such file is
-            searched for.
-        target_format: format of the file whose size or PSNR counts: ".ply", ".spz", ".sog", ...
-        views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair
-            uses the others if there are more than twice as many; else it samples views.
+        effort: length of the repair in steps: 0 ("instant"), 192 ("quick") or 1200 ("thorough"); up
+            to four times as many for more than 20,000 Gaussians.
+        seconds: duration of the repair, in place of ``effort``. Ctrl-C ends the repair early and
+            returns the scene so far.
+        photos: train on photos in place of the repair, by 2400 ("quick") or 12000 ("thorough")
+            steps, or for ``seconds``; values as for :func:`prune`.
+        target_db: minimum PSNR of the final file against renders of the given scene, over the
+            pixels that it covers, dB, in place of ``keep``. The smallest such file is searched for.
+        target_format: format for a file size or PSNR: ".ply", ".spz", ".sog", ...
+        views: cameras for comparison, as for :func:`prune`; at most 12 are used. The repair uses
+            the others, and samples views if there are too few.
         resolution, up, data, progress: as for :func:`prune`.
 
     Returns:
-        ``.scene``, ``.accepted`` (whether the refiner is in it), ``.psnr`` (dB against the given
-        scene's renders), ``.seconds``, ``.verdict`` (text on the gains), and more: see
-        :class:`Compacted`.
+        ``.scene``, ``.accepted`` (whether the refinement was), ``.psnr`` (dB against the given
+        scene), ``.seconds``, ``.verdict`` (text on the gains), and more: see :class:`Compacted`.
 
     Raises:
-        BudgetError: if the budget or the PSNR cannot be met; the text tells the reachable values.
+        BudgetError: if the budget or the PSNR cannot be met; the message has the reachable values.
         SceneError: if no Gaussian can be drawn, the file is not usable, or the SH degree exceeds
             the refiner's.
         DataError: if the budget or ``sh`` needs views and there are none.
@@ -246,13 +244,13 @@ class Compacted(Report):
 
     @property
     def verdict(self) -> str:
-        """A line of text for each stage after pruning: its gain, or why it is left out. One line if
+        """A line of text per stage after pruning: its gain, or the reason to reject it. One line if
         there is no such stage."""
         return verdict_text(self)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Lines of text: origin of the views, SH bands dropped, PSNR reached."""
+        """Lines of text: origin of the views, cut SH bands, cleaning, search."""
         return note_lines(self)
 
 
@@ -267,21 +265,21 @@ def clean(
     data: str | Path | None = None,
     progress: bool | Progress = False,
 ) -> Gaussians:
-    """Remove floaters from a scene, and what cannot be drawn or is never visible. No photos are
-    needed.
+    """Remove floaters from a scene, and Gaussians that cannot be drawn or are never visible. Needs
+    no photos.
 
-    Findings (counts, clusters, PSNR without what goes) are logged at level INFO.
+    Results (counts, clusters, PSNR after removal) are logged at level INFO.
 
     Args:
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
-        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show,
-            without which pictures hardly change. 0 removes none.
-        picture: a PNG file to write: the scene, what goes in a colour for each cluster, and the
+        strength: strength of the removal of floaters, in [0, 1]. Floaters are Gaussians far in
+            front of the visible surfaces that hardly change pictures. 0 removes none.
+        picture: PNG file for the scene, the removed Gaussians with a colour per cluster, and the
             result.
         views, resolution, up, data, progress: as for :func:`pointsplat_ns.prune`.
 
     Returns:
-        The other Gaussians, bit for bit and in order, at least one, on the device of the given
+        The remaining Gaussians, at least one, bit for bit and in order, on the device of the given
         scene.
 
     Raises:
@@ -321,17 +319,17 @@ def lod(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Levels:
-    """Make levels of detail: a scene merged to ever fewer Gaussians in one pass, with the error of
-    each level.
+    """Make levels of detail: merge a scene to ever fewer Gaussians in one pass, and measure each
+    level.
 
-    Each level is merged from the level before, so levels are nested: every Gaussian has one parent
+    Each level is merged from the previous one, so levels are nested: every Gaussian has one parent
     in the next coarser level.
 
     Args:
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
         levels: sizes of the levels, as ``keep`` of :func:`prune` except "auto"; in any order.
         sh: SH bands of every level, as for :func:`prune`.
-        effort: length of a repair of each level, as for :func:`compact`; its Gaussians keep their
+        effort: length of the repair of each level, as for :func:`compact`; Gaussians keep their
             parents.
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution, up, data, progress: as for :func:`prune`.
@@ -339,14 +337,14 @@ def lod(
             ends in .rad is a file of all levels for Spark.
         stream: write a streamed SOG instead.
         tiles: write 3D Tiles instead.
-        at: where tiles lie on the Earth: the UTM zone of the scene's coordinates ("EPSG:32632"), or
-            the latitude, longitude and height of its origin ("48.86,2.29,35"); by default they have
+        at: place of the tiles on the Earth: UTM zone of the scene's coordinates ("EPSG:32632"), or
+            latitude, longitude and height of its origin ("48.86,2.29,35"); by default tiles keep
             the frame of the scene's file.
         force: overwrite existing files in ``folder``.
 
     Returns:
-        The levels, the finest first, with exactly the requested numbers of Gaussians; their errors,
-        and the parent of each Gaussian: see :class:`Levels`.
+        The levels, the finest first, with exactly the requested counts, their quality, and the
+        parents of all Gaussians: see :class:`Levels`.
 
     Raises:
         BudgetError: if a level does not fit the scene, or two levels have the same number of
@@ -390,15 +388,15 @@ def plot_views(
     up: str | None = None,
     data: str | Path | None = None,
 ) -> str:
-    """Draw the views that decide about a scene: a sheet of up to 16 pictures.
+    """Draw the views used for decisions on a scene: a sheet of up to 16 pictures.
 
     Args:
         scene: N Gaussians, or the path of a scene.
-        path: the PNG file to write.
+        path: PNG file to write.
         views, resolution, up, data: as for :func:`prune`.
 
     Returns:
-        A line of text: how many views there are, and their origin.
+        A line of text: number, size and origin of the views.
 
     Raises:
         SceneError: if the scene is not usable, or the file cannot be written.
@@ -419,17 +417,17 @@ def plot_views(
 
 
 def _named(views: Views | str | Path | None) -> str | Path | None:
-    """The path that names views; None if there is none."""
+    """The path in ``views``; None if there is none."""
     return None if isinstance(views, Views) else views
 
 
 def _given(views: Views | str | Path | None) -> Views | None:
-    """Views that are given as such."""
+    """The views in ``views``; None if it is a path."""
     return views if isinstance(views, Views) else None
 
 
 def _bytes(memory: float | str | None) -> float | None:
-    """Bytes of a size in units of 10^6 bytes, or in words."""
+    """A memory limit in bytes, from units of 10^6 bytes or text."""
     if memory is None:
         return None
     return 1e6 * (parse_megabytes(memory) if isinstance(memory, str) else memory)

@@ -70,7 +70,7 @@ def test_a_run_of_the_refiner_is_loaded_pruned_and_refined(refiner_run, caplog):
     pruned = ps.prune(ball(80), 0.25, "opacity")
     assert same(loaded, pruned.replace(opacities=pruned.opacities + 0.5))
     assert "b: pruned by opacity (keep 0.25) and refined" in caplog.text
-    with pytest.raises(ps.SceneError, match="scene 'c': no such scene in .*; there are a, b"):
+    with pytest.raises(ps.SceneError, match="scene 'c': no such scene in .*; expected one of a, b"):
         ps.load(refiner_run, "c")
 
 

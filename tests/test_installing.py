@@ -182,7 +182,7 @@ def test_what_the_package_itself_lacks_is_one_line_too(monkeypatch, capsys, tmp_
     lacks = mock.Mock(side_effect=ModuleNotFoundError("No module named 'av'", name="av"))
     monkeypatch.setattr("pointsplat_ns.info", lacks)
     said = refusal(capsys, tmp_path, "info", tmp_path / "a.ply")
-    assert said == "error: av is not installed; pip install pointsplat-ns adds what is missing"
+    assert said == "error: av is not installed; pip install pointsplat-ns installs it"
 
 
 def test_a_package_that_is_there_but_broken_keeps_its_error(monkeypatch, tmp_path):

@@ -33,14 +33,14 @@ COMMANDS = (
     "export",
     "demo",
 )
-"""The commands. Each is a function in a module of the same name, which is imported when the command
-runs."""
+"""Names of the commands. A command is a function in a module of the same name, which is imported on
+use."""
 
 
-class _Shown:
-    """A text stream that shows control characters, such as those in the name of a file, instead of
-    sending them. Colours and the moves of progress bars are sent, unless it is ``plain``; then it
-    is no terminal to libraries, and gets none."""
+class _EscapingStream:
+    """A text stream that escapes control characters, such as those in a file name. Colours and
+    cursor moves of progress bars pass, unless it is ``plain``: then libraries see no terminal, and
+    send none."""
 
     def __init__(self, stream: TextIO, plain: bool = False):
         self._stream = stream
@@ -54,11 +54,16 @@ class _Shown:
             lines = text.split("\n")
             self._stream.write("\n".join(map(printable, lines)))
             return len(text)
-        # Colours and the moves of progress bars, which are ours; then any other control characters,
-        # which are not.
-        steering = r"\x1b\[(?:[\d;]*m|\?25[lh]|\d*[AK])|[^\t\n\r\x20-\x7e\xa0-\U0010ffff]+"
+        # Colours and cursor moves, which the program sends; then all other control characters.
+        allowed_or_control = (
+            r"\x1b\[(?:[\d;]*m|\?25[lh]|\d*[AK])|[^\t\n\r\x20-\x7e\xa0-\U0010ffff]+"
+        )
         self._stream.write(
-            re.sub(steering, lambda m: m[0] if m[0].startswith("\x1b[") else printable(m[0]), text)
+            re.sub(
+                allowed_or_control,
+                lambda m: m[0] if m[0].startswith("\x1b[") else printable(m[0]),
+                text,
+            )
         )
         return len(text)
 
@@ -68,23 +73,23 @@ class _Shown:
 
 @contextmanager
 def any_text_printable(plain: bool = False) -> Iterator[None]:
-    """Let standard output and standard error take any text while the context is open.
+    """Make standard output and standard error accept any text in this context.
 
-    Streams that are closed go nowhere. Characters that an encoding lacks are replaced. Control
-    characters are shown as Python writes them, such as ``\\x1b``; only colours and progress bars
-    reach a terminal, and not these if ``plain``.
+    Output to closed streams is discarded. Characters outside of the encoding are replaced. Control
+    characters are escaped as in Python, such as ``\\x1b``; only colours and progress bars reach a
+    terminal, and not even those if ``plain``.
     """
     for number in (0, 1, 2):
         try:
             os.fstat(number)
-        except OSError:  # the lowest free number is this one: no file that is written gets it
+        except OSError:  # takes the lowest free number, this one, so that no output file gets it
             os.open(os.devnull, os.O_RDWR)
     before = sys.stdout, sys.stderr
     out, err = (stream or open(os.devnull, "w", encoding="utf-8") for stream in before)
     errors = out.errors
     if isinstance(out, io.TextIOWrapper):
         out.reconfigure(errors="replace")
-    sys.stdout, sys.stderr = (cast(TextIO, _Shown(stream, plain)) for stream in (out, err))
+    sys.stdout, sys.stderr = (cast(TextIO, _EscapingStream(stream, plain)) for stream in (out, err))
     try:
         yield
     finally:
@@ -94,7 +99,8 @@ def any_text_printable(plain: bool = False) -> Iterator[None]:
 
 
 class _PrintHandler(logging.Handler):
-    """Prints what the package logs: findings on standard output, warnings on standard error."""
+    """Prints log records of the package: information on standard output, warnings on standard
+    error."""
 
     def emit(self, record: logging.LogRecord) -> None:
         is_warning = record.levelno >= logging.WARNING
@@ -103,7 +109,7 @@ class _PrintHandler(logging.Handler):
 
 @contextmanager
 def _log_printed(level_printed: int) -> Iterator[None]:
-    """Print the package's log, from a level on, while the context is open."""
+    """Print log records of the package of at least a level in this context."""
     logger = logging.getLogger("pointsplat_ns")
     handlers = logger.handlers
     propagate = logger.propagate
@@ -121,18 +127,16 @@ def _log_printed(level_printed: int) -> Iterator[None]:
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Let a lost terminal (SIGHUP) and a termination request (SIGTERM) unwind the program as Ctrl-C
-    does instead of killing it, so that unfinished files are removed and workers stopped."""
+    """Make SIGHUP (a lost terminal) and SIGTERM unwind the program like Ctrl-C, so that unfinished
+    files are removed and workers are stopped."""
 
     def end(number: int, frame: Any) -> None:
         sys.exit(128 + number)
 
-    numbers = [
-        getattr(signal, name) for name in ("SIGHUP", "SIGTERM") if hasattr(signal, name)
-    ]  # none on Windows
-    if (
-        threading.current_thread() is not threading.main_thread()
-    ):  # only the main thread may set handlers
+    names = ("SIGHUP", "SIGTERM")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]  # none on Windows
+    # Only the main thread may set handlers.
+    if threading.current_thread() is not threading.main_thread():
         numbers = []
     before = {n: signal.signal(n, end) for n in numbers if signal.getsignal(n) is signal.SIG_DFL}
     try:
@@ -142,10 +146,10 @@ def _ended_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _what_failed(error: Exception) -> str:
-    """An error of the system in one line."""
+def _system_error_text(error: Exception) -> str:
+    """A system error in one line."""
     if isinstance(error, ModuleNotFoundError):
-        return f"{error.name} is not installed; pip install pointsplat-ns adds what is missing"
+        return f"{error.name} is not installed; pip install pointsplat-ns installs it"
     if isinstance(error, ImportError):
         return f"{error}; torch takes 4 GB of address space (ulimit -v)"
     from pointsplat_ns.system.files import one_line  # which imports torch
@@ -160,9 +164,9 @@ def _what_failed(error: Exception) -> str:
 
 
 def _is_bug(error: Exception) -> bool:
-    """Whether an error is none of the input or of the machine: a module of ours that is missing, a
-    name that a module lacks, or a RuntimeError other than of torch's memory, which has no type of
-    its own on a CPU."""
+    """Whether an error is a bug, not a fault of the input or the machine: a missing module or name
+    of this package, or a RuntimeError other than torch's lack of memory, which has no type of its
+    own on a CPU."""
     if isinstance(error, ModuleNotFoundError):
         return error.name is None or error.name.startswith(__package__.partition(".")[0])
     if isinstance(error, ImportError):
@@ -171,15 +175,14 @@ def _is_bug(error: Exception) -> bool:
         return False
     import torch
 
-    return not isinstance(
-        error, torch.cuda.OutOfMemoryError
-    ) and "can't allocate memory" not in str(error)
+    if isinstance(error, torch.cuda.OutOfMemoryError):
+        return False
+    return "can't allocate memory" not in str(error)
 
 
 def _ignore_matplotlibrc() -> None:
-    """Keep matplotlib from obeying a file ``matplotlibrc`` in the current folder, which may be a
-    stranger's, before the user's own. It looks for one when it is imported, so that is done
-    elsewhere."""
+    """Make matplotlib ignore an untrusted ``matplotlibrc`` in the current folder. It reads the file
+    on import, so it is imported from another folder."""
     if not os.path.lexists("matplotlibrc"):
         return
     here = os.getcwd()
@@ -191,13 +194,13 @@ def _ignore_matplotlibrc() -> None:
 
 
 def _command(name: str) -> Callable[..., None]:
-    """The function of a command, in the module of the same name."""
+    """The function of a command."""
     return getattr(importlib.import_module(f"{__package__}.{name}"), name)
 
 
 def _subcommands(summaries: bool) -> Any:
-    """A type that tyro reads as all commands; described by the first sentence of their docstrings
-    if ``summaries``, for the list of commands."""
+    """The union of all commands, for tyro. With ``summaries``, the first sentences of their
+    docstrings describe them in the list of commands."""
     import tyro
 
     kinds = []
@@ -212,11 +215,9 @@ def _subcommands(summaries: bool) -> Any:
 
 
 def program() -> NoReturn:
-    """The program ``pointsplat``: :func:`main`, then the end of the process with status 0, without
-    unloading torch's libraries, which takes 0.4 CPU seconds."""
-    gc.set_threshold(
-        100_000
-    )  # searching the objects of torch's modules for garbage takes 0.2 s by default
+    """The program ``pointsplat``: :func:`main`, then exit with status 0, without unloading torch's
+    libraries, which takes 0.4 CPU seconds."""
+    gc.set_threshold(100_000)  # by default, collecting the objects of torch's modules takes 0.2 s
     main()
     atexit._run_exitfuncs()
     for stream in filter(None, (sys.stdout, sys.stderr)):
@@ -225,11 +226,11 @@ def program() -> NoReturn:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run one subcommand; by default that of the program's own arguments.
+    """Run one subcommand, by default with the program's own arguments.
 
-    Unusable input, files that cannot be read or written, a lack of memory and a missing package end
-    it with one line and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its
-    number. With ``--json``, standard output has one JSON value and nothing else.
+    Unusable input, unreadable or unwritable files, lack of memory and missing packages give an
+    error of one line and exit status 1. Ctrl-C gives 130, another signal 128 plus its number. With
+    ``--json``, standard output is one JSON value and nothing else.
     """
     args = sys.argv[1:] if args is None else args
     with any_text_printable(plain=not all(map(str.isprintable, args))):  # what tyro prints of them
@@ -239,14 +240,13 @@ def main(args: list[str] | None = None) -> None:
             text = f"error: {error}"
             status = 1
         except BrokenPipeError:  # of `pointsplat ... | head`
-            os.dup2(
-                os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-            )  # what it did not take is not tried again
+            # The rest of the output must not be written again at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)
         except (ImportError, OSError, MemoryError, RuntimeError) as error:
             if _is_bug(error):
                 raise
-            text = f"error: {printable(_what_failed(error))}"
+            text = f"error: {printable(_system_error_text(error))}"
             status = 1
         except KeyboardInterrupt:
             text = "interrupted"
@@ -258,7 +258,7 @@ def main(args: list[str] | None = None) -> None:
 
 
 def _run(args: list[str]) -> None:
-    """Run one subcommand. What it printed is with the reader when this returns or raises."""
+    """Run one subcommand, and flush its output."""
     try:
         import tyro
 
@@ -284,7 +284,7 @@ def _run(args: list[str]) -> None:
             elif args and args[0] in COMMANDS:
                 tyro.cli(_command(args[0]), prog=f"pointsplat {args[0]}", args=args[1:])
             else:
-                about = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them."
+                about = "Make trained 3D Gaussian Splatting scenes smaller, and view them."
                 about += " `--version` prints the version."
                 kinds = _subcommands(summaries=args in (["-h"], ["--help"]))
                 tyro.cli(kinds, prog="pointsplat", description=about, args=args)
@@ -293,4 +293,4 @@ def _run(args: list[str]) -> None:
             say("", *text.splitlines())
         raise
     finally:
-        sys.stdout.flush()  # a full disk or a closed pipe is noticed here
+        sys.stdout.flush()  # raises an error for a full disk or a closed pipe

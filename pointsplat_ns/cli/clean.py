@@ -1,4 +1,4 @@
-"""``pointsplat clean``: a scene without what no picture needs."""
+"""``pointsplat clean``: remove Gaussians that no picture needs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ def clean(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Remove floaters, and what cannot be drawn or is never visible.
+    """Remove floaters, and Gaussians that cannot be drawn or are never visible.
 
     Args:
-        output: file to write: .ply, .spz, .sog, .splat; by default in the format of the scene and
-            beside it: room_clean.ply for room.ply.
-        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show,
-            without which pictures hardly change. 0 removes only what cannot be drawn or seen.
-        picture: a .png file that shows, in three views, the scene, what goes in a colour for each
+        output: file to write (.ply, .spz, .sog or .splat); by default beside the scene, in its
+            format: room_clean.ply for room.ply.
+        strength: strength of the removal of floaters, in [0, 1]. Floaters are Gaussians far in
+            front of the visible surfaces that hardly change pictures. 0 removes only Gaussians that
+            cannot be drawn or seen.
+        picture: .png file with three views of the scene, the removed Gaussians with a colour per
             cluster, and the result; by default none.
     """
     options.need_scenes(scene)
@@ -53,4 +54,4 @@ def clean(
         return
     print_result("clean", [], before, done.scene, done.seconds, output, quality)
     if picture is not None:
-        say(f"{picture}: the scene, what goes, and the result, side by side")
+        say(f"{picture}: the scene, the removed Gaussians and the result, side by side")

@@ -1,4 +1,4 @@
-"""``pointsplat compact``: make a scene smaller and repair it in one go."""
+"""``pointsplat compact``: make a scene smaller and repair it."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ GoalName = Literal["web", "phone", "headset", "email"]
 
 
 class Goal(NamedTuple):
-    """What a purpose asks for."""
+    """Format, size and page for a purpose."""
 
     suffix: str | None = None
-    """Suffix of the file; None for that of the scene."""
+    """Suffix of the file; None for the format of the scene."""
     keep: str | None = None
-    """Budget; None for the usual one."""
+    """Budget; None for the default."""
     page: bool = False
-    """Whether a page with the scene alone is written beside the file."""
+    """Whether to write a page with only the result beside the file."""
     page_mb: float = 60.0
-    """Largest page, in units of 10^6 bytes."""
+    """Maximum size of the page, 10^6 bytes."""
     use: str = "to fly through in a browser"
-    """Text on the use of a page."""
+    """Text on the use of the page."""
 
 
 GOALS: dict[GoalName | None, Goal] = {
@@ -74,44 +74,46 @@ def compact(
     verbose: options.Verbose = False,
     json_output: options.Json = False,
 ) -> None:
-    """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.
+    """Make a scene smaller and repair it, or all scenes of a folder. Needs no photos.
 
-    Neighbours are merged; with --refiner a network refines the result in one pass; then learned
-    steps repair it: they bring it closer to renders of the dense scene. Each change is compared in
-    other views, and left out if it harms pictures of any size. Views are those of --poses, else
-    those of the run's dataset; if there are none, they are sampled.
+    Neighbours are merged. With --refiner, a network refines the result in one pass. Then learned
+    steps repair it: they bring it closer to renders of the dense scene. Every change is checked in
+    other views, and rejected if it harms pictures of any size. Views come from --poses, else from
+    the run's dataset, else they are sampled.
 
-    A folder with config.yml is a run: one scene. Any other folder is a folder of scenes: all files
-    with Gaussians below it, and the newest Splatfacto run of each experiment. Finished scenes are
-    skipped, so the same command continues after an interruption.
+    A folder with config.yml is a run, with one scene. Any other folder is a folder of scenes: all
+    files with Gaussians below it, and the newest Splatfacto run of each experiment. Finished scenes
+    are skipped, so the same command continues after an interruption.
 
     Args:
-        output: the file to write, of any format as for prune; by default in the format of the scene
-            and beside it: room_compact.ply for room.ply, compact.ply in the folder of a run. For a
-            folder of scenes, another folder; by default rooms_compact beside rooms. Each result
-            there has the format of its scene.
-        goal: the purpose, in place of --keep and the format: web (a .sog of 2 MB, and a page with
-            the scene to paste into another), phone (a .sog of at most 500,000 Gaussians), headset
-            (an .spz of at most 400,000), email (an .spz of 5 MB, and a page that opens with a
-            double click). --keep, --target-db and --html replace its parts.
-        picture: a .png file for images of some views: dense, before and after the repair, side by
-            side; for a folder, all scenes before and after; by default none.
-        html: an .html file that opens offline in a browser, to fly through the scene before and
-            after, with a wipe between them; for a folder, a gallery of all scenes before and after;
-            by default none.
+        output: file to write, of any format as for prune; by default beside the scene, in its
+            format: room_compact.ply for room.ply, compact.ply in the folder of a run. For a folder
+            of scenes, another folder; by default rooms_compact beside rooms, with results in the
+            formats of their scenes.
+        goal: purpose, in place of --keep and a format: web (a .sog of 2 MB, and a page to embed in
+            a web site), phone (a .sog of at most 500,000 Gaussians), headset (an .spz of at most
+            400,000), email (an .spz of 5 MB, and a page that opens with a double click). --keep,
+            --target-db and --html override its parts.
+        picture: .png file with some views of the dense scene and of the scene before and after the
+            repair, side by side; for a folder, all scenes before and after; by default none.
+        html: .html file to fly through the scene before and after, offline in a browser, with a
+            wipe between them; for a folder, a gallery of all scenes before and after; by default
+            none.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.scene.reading import is_folder_of_scenes
 
     purpose = GOALS[goal]
-    unasked = goal is None and how.keep is None and how.refiner is None and how.target_db is None
+    default_budget = (
+        goal is None and how.keep is None and how.refiner is None and how.target_db is None
+    )
     if how.keep is None and how.target_db is None:
         how = replace(how, keep=purpose.keep)
     if is_folder_of_scenes(scene):
         return _compact_folder(scene, how, output, purpose, picture, html, force, jobs, json_output)
     if jobs is not None:
-        raise ps.SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
+        raise ps.SceneError(f"{scene}: a single scene; --jobs is for a folder of scenes")
     from pointsplat_ns.pipeline import run
     from pointsplat_ns.pipeline.quality import quality_of_file
     from pointsplat_ns.scene.formats import format_to_write
@@ -119,13 +121,10 @@ def compact(
     from pointsplat_ns.tools.wording import log_report, quality_details
 
     options.check_poses(how.poses)
-    if (
-        output is not None
-        and purpose.suffix is not None
-        and not output.name.lower().endswith(purpose.suffix)
-    ):
+    suffix = purpose.suffix or ""
+    if output is not None and not output.name.lower().endswith(suffix):
         raise ps.SceneError(
-            f"{output}: --for {goal} writes {purpose.suffix}; expected such a name, or --keep in "
+            f"{output}: --for {goal} writes {purpose.suffix}; expected that suffix, or --keep in "
             "place of --for"
         )
     output = output or options.output_beside(scene, goal or "compact", purpose.suffix)
@@ -162,7 +161,7 @@ def compact(
         _print_use(goal, html, scene, quality)
     if report.interrupted:
         raise KeyboardInterrupt  # once the best result so far is written and printed
-    if unasked and not json_output:
+    if default_budget and not json_output:
         _print_next(scene, output, quality)
 
 
@@ -219,7 +218,7 @@ def _write_page(
     up: str | None,
     limit_mb: float,
 ) -> None:
-    """Write the page to fly through a result, beside the dense scene unless it stands ``alone``."""
+    """Write a page to fly through the result, next to the dense scene unless ``alone``."""
     import pointsplat_ns as ps
     from pointsplat_ns.pipeline.view_provider import Origin
     from pointsplat_ns.scene.runs import name_of
@@ -233,7 +232,9 @@ def _write_page(
         None if alone else [f"dense ({files[0]})", f"compact ({files[1]})"],
         title=name_of(scene),
         notes=[] if alone or quality is None else [quality_text(quality)],
-        views=None if sampled else report.views,  # the page opens better without sampled ones
+        views=None
+        if sampled
+        else report.views,  # the page finds a better first view than sampled ones
         up=up,
         limit_mb=limit_mb,
         progress=True,
@@ -273,7 +274,7 @@ def _print_result(report: Report, output: Path, quality: Quality | None) -> None
 def _print_folder(
     results: list[SceneResult], folder: Path, shown: list[Path], json_output: bool
 ) -> None:
-    """Print a table of the scenes of a folder, or JSON. Raises PointSplatError if one has
+    """Print the results of a folder as a table, or as JSON. Raises PointSplatError if a scene
     failed."""
     from pointsplat_ns.errors import PointSplatError
     from pointsplat_ns.scene.discovery import FOLDER_FILES
@@ -291,10 +292,9 @@ def _print_folder(
                 "-" if value is None else f"{value:{form}}"
                 for value, form in zip(numbers, forms, strict=True)
             )
-            said = result.error or result.note
-            rows.append(
-                (result.name, *cells, f"{result.status}: {said}" if said else result.status)
-            )
+            remark = result.error or result.note
+            status = f"{result.status}: {remark}" if remark else result.status
+            rows.append((result.name, *cells, status))
         header = ("scene", "before", "after", "MB", "dB", "seconds", "status")
         print_table(header, rows, "dB: PSNR against the scene's own renders", left=(0, 6))
         say(
@@ -305,27 +305,25 @@ def _print_folder(
             say(f"{path}: all scenes before and after")
     if failed:
         raise PointSplatError(
-            f"{failed} of {len(results)} scenes failed; the same command tries them again"
+            f"{failed} of {len(results)} scenes failed; run the same command to retry them"
         )
 
 
 def _file_text(path: Path) -> str:
-    """Name and size of a scene's file or SOG folder; the name alone of a run."""
+    """Name and size of a scene's file or SOG folder; only the name of a run."""
     from pointsplat_ns.scene.formats import SOG_META
     from pointsplat_ns.scene.runs import name_of
 
     file = path / SOG_META if path.is_dir() else path
-    return (
-        f"{path.name}, {written_size(file)}"
-        if file.is_file() and file.suffix != ".yml"
-        else name_of(path)
-    )
+    if file.is_file() and file.suffix != ".yml":
+        return f"{path.name}, {written_size(file)}"
+    return name_of(path)
 
 
 def _print_use(
     goal: GoalName | None, page: Path | None, scene: Path, quality: Quality | None
 ) -> None:
-    """Print what a page of a scene is for; for a headset, also the fill, which can slow it."""
+    """Print the use of a page; for a headset also the fill, which limits its speed."""
     from pointsplat_ns.scene.runs import name_of
 
     if page is not None:
@@ -333,24 +331,20 @@ def _print_use(
         say(f"{page}: {written_size(page)}, {use}")
     if goal == "headset" and quality is not None:
         fill = f"{quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
-        say(f"fill: {fill}; where it is too slow near things, a smaller --keep lowers it")
+        say(f"fill: {fill}; if close-up views are too slow, use a smaller --keep")
 
 
 def _print_next(scene: Path, output: Path, quality: Quality | None) -> None:
-    """Print two commands to try after a budget that nobody chose: a look at the result, and another
-    budget where its PSNR asks for one, else a goal."""
-    share = (
-        "30%"
-        if quality is not None and quality.psnr < 27.0
-        else "3%"
-        if quality and quality.psnr > 35.0
-        else None
-    )
-    other = (
-        ["--for", "web"]
-        if share is None
-        else ["--keep", share, "-o", str(options.output_beside(scene, share[:-1]))]
-    )
+    """Print two commands to try after the default budget: a view of the result, and another budget
+    if the PSNR suggests one, else a goal."""
+    share = None
+    if quality is not None and quality.psnr < 27.0:
+        share = "30%"
+    elif quality is not None and quality.psnr > 35.0:
+        share = "3%"
+    other = ["--for", "web"]
+    if share is not None:
+        other = ["--keep", share, "-o", str(options.output_beside(scene, share[:-1]))]
     commands = (
         ["pointsplat", "view", str(scene), str(output)],
         ["pointsplat", "compact", str(scene), *other],

@@ -1,4 +1,4 @@
-"""``pointsplat convert``: a scene in another format, turned and scaled."""
+"""``pointsplat convert``: write a scene in another format, rotated or scaled."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ def convert(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Write a scene in another format. What formats lose stands in docs/formats.md.
+    """Write a scene in another format. docs/formats.md describes the losses of formats.
 
     Args:
-        scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat), a
-            Splatfacto checkpoint, or a run (its folder or config.yml).
-        output: the file to write; its name says the format: .ply, .spz, .sog or .splat.
-        sh: SH bands to keep: all, or up to a degree.
-        up: the new up axis: x, y, z, -x, -y or -z. By default nothing is turned. The old up
-            direction is estimated; -y:z names it as -y. Write --up=-y for a negative axis.
+        scene: file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat),
+            Splatfacto checkpoint, or run (its folder or config.yml).
+        output: file to write; its suffix sets the format: .ply, .spz, .sog or .splat.
+        sh: SH bands to keep: all, or a maximum degree.
+        up: new up axis: x, y, z, -x, -y or -z; by default nothing is rotated. The old up direction
+            is declared by the file, or estimated; -y:z gives it as -y. Write --up=-y for a negative
+            axis.
         scale: factor on positions and sizes.
-        original_frame: for a Splatfacto run: undo nerfstudio's rotation, shift and scale of its
-            data.
+        original_frame: undo nerfstudio's rotation, translation and scale of the data of a
+            Splatfacto run.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps

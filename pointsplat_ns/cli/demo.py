@@ -1,4 +1,4 @@
-"""``pointsplat demo``: a scene to try commands with."""
+"""``pointsplat demo``: write an example scene."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from pointsplat_ns.system.terminal import say
 
 
 def demo(output: options.Output = None, force: options.Force = False) -> None:
-    """Write the scene that ships, a furnished room.
+    """Write the example scene, a furnished room.
 
     Args:
-        output: the file to write, of any format as for prune; by default room.ply in this folder.
+        output: file to write, of any format as for prune; by default room.ply in the current
+            folder.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.system.outputs import unnamed

@@ -1,4 +1,4 @@
-"""``pointsplat export``: the scene of a run as a file."""
+"""``pointsplat export``: write the scene of a run to a file."""
 
 from __future__ import annotations
 
@@ -22,16 +22,15 @@ def export(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Write the refined scene of a pointsplat run, or the trained one of a Splatfacto run, as a
+    """Write the refined scene of a pointsplat run, or the trained scene of a Splatfacto run, to a
     file of any format.
 
     Args:
-        run: the run's folder, config.yml or checkpoint.
-        output: the file to write, of any format as for prune.
+        run: folder, config.yml or checkpoint of the run.
+        output: file to write, of any format as for prune.
         scene: name of a scene of a pointsplat run; by default the first held-out one, or else the
             first.
-        data: folder of the scenes of a pointsplat run, or one above it, if they are no longer where
-            the run says.
+        data: folder of the scenes of a pointsplat run, or a folder above it, if they have moved.
     """
     options.need_scenes(run)
     import pointsplat_ns as ps

@@ -1,5 +1,4 @@
-"""Text of ``--help`` after the options: examples of every command, and meanings of exit
-statuses."""
+"""Text of ``--help`` after the options: examples of every command, and exit statuses."""
 
 from __future__ import annotations
 
@@ -22,21 +21,24 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ),
     ),
     "clean": (
-        ("what floats or is hidden goes, to room_clean.ply", "pointsplat clean room.ply"),
-        ("a picture of what goes", "pointsplat clean room.ply --strength 0.3 --picture gone.png"),
+        ("without floaters and hidden Gaussians", "pointsplat clean room.ply"),
+        (
+            "a picture of the removed Gaussians",
+            "pointsplat clean room.ply --strength 0.3 --picture gone.png",
+        ),
     ),
     "lod": (
         ("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),
-        ("a stream for viewers on the web", "pointsplat lod room.ply --stream -o page"),
+        ("a stream for web viewers", "pointsplat lod room.ply --stream -o page"),
     ),
-    "tradeoff": (("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),),
+    "tradeoff": (("measure the tradeoff, to room_tradeoff", "pointsplat tradeoff room.ply"),),
     "convert": (
-        ("an SPZ of fewer SH bands", "pointsplat convert room.ply room.spz --sh 1"),
-        ("what is up, -y, turned to z", "pointsplat convert room.ply turned.spz --up=-y:z"),
+        ("an SPZ with fewer SH bands", "pointsplat convert room.ply room.spz --sh 1"),
+        ("rotated, from -y up to z up", "pointsplat convert room.ply turned.spz --up=-y:z"),
     ),
     "info": (
-        ("what is in a scene", "pointsplat info room.ply"),
-        ("where other commands look at it from", "pointsplat info room.ply --views sheet.png"),
+        ("figures of a scene", "pointsplat info room.ply"),
+        ("the views of other commands", "pointsplat info room.ply --views sheet.png"),
     ),
     "view": (
         ("a scene in the browser", "pointsplat view room.ply"),
@@ -51,25 +53,25 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "demo": (("a scene to try commands with: room.ply", "pointsplat demo"),),
 }
-"""Command lines of every command, with the purpose of each."""
+"""Example command lines of every command, with their purposes."""
 
 
 def after_help(args: list[str]) -> str:
-    """Text to print after the help that arguments ask for; empty if they ask for none."""
+    """Text to print after the help; empty if the arguments do not request help."""
     if not {"-h", "--help"} & {*args}:
         return ""
     if args[0] in EXAMPLES:
         lines = [
-            line for what, command in EXAMPLES[args[0]] for line in (f"  # {what}", f"  {command}")
+            line
+            for purpose, command in EXAMPLES[args[0]]
+            for line in (f"  # {purpose}", f"  {command}")
         ]
         return "\n".join(["examples:", *lines])
     return """exit status:
   0    done
-  1    an error, in one line on standard error; with a traceback, a bug of ours
-  2    a command line that is not understood
-  129  the terminal was lost (SIGHUP)
-  130  interrupted by Ctrl-C (SIGINT)
-  143  asked to end (SIGTERM)
+  1    an error, in one line on standard error; a traceback means a bug in pointsplat 2    an
+  invalid command line 129  the terminal was lost (SIGHUP) 130  interrupted by Ctrl-C (SIGINT) 143
+  terminated (SIGTERM)
 
 `pointsplat COMMAND --help` has examples.
 Completion in your shell: `pointsplat --tyro-write-completion bash FILE`; zsh and tcsh as well."""

@@ -1,4 +1,4 @@
-"""``pointsplat info``: figures of scenes."""
+"""``pointsplat info``: print figures of scenes."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def info(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, and rows
-    that look wrong. Several, and all scenes of a folder, make a table.
+    """Print figures of scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, and
+    suspicious rows. Several scenes, and folders of scenes, give a table.
 
     Args:
         scenes: files of any format, checkpoints, runs (their folder or config.yml), or folders of
             scenes.
-        views: a .png file for a sheet of the views that other commands use without --poses, for one
-            scene; by default none.
-        json_output: print JSON, and nothing else on standard output: an object, or a list for
+        views: .png file with the views that other commands use without --poses, for a single scene;
+            by default none.
+        json_output: print JSON and nothing else on standard output: an object, or a list for
             several scenes.
     """
     import pointsplat_ns as ps
@@ -57,11 +57,9 @@ def info(
                 raise
             say(f"error: {error}", error=True)
             failed.append({"file": str(scene), "error": str(error)})
-    sheet = (
-        None
-        if views is None
-        else ps.plot_views(scenes[0], views, resolution=resolution, up=up, data=data)
-    )
+    sheet = None
+    if views is not None:
+        sheet = ps.plot_views(scenes[0], views, resolution=resolution, up=up, data=data)
     if json_output:
         rows = [*(one.as_dict() for one in found), *failed]
         print_json(rows if len(rows) > 1 else rows[0])
@@ -76,7 +74,7 @@ def info(
 
 
 def _scenes_of(path: Path) -> list[Path]:
-    """A scene itself, or the scenes of a folder."""
+    """The scene at a path, or the scenes of a folder."""
     from pointsplat_ns.scene.discovery import find_scenes
     from pointsplat_ns.scene.reading import is_folder_of_scenes
 
@@ -84,7 +82,7 @@ def _scenes_of(path: Path) -> list[Path]:
 
 
 def _print_table(found: list[SceneInfo]) -> None:
-    """A line for each scene, sizes in MB."""
+    """Print a line per scene, sizes in MB."""
     from pointsplat_ns.system.files import three_digits
     from pointsplat_ns.system.terminal import print_table
 
@@ -110,20 +108,18 @@ def _print(found: SceneInfo) -> None:
     from pointsplat_ns.system.files import bytes_text
 
     say(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
-    say(
-        f"{found.gaussians:,} Gaussians of SH degree "
-        f"{found.sh_degree}{', antialiased' if found.antialiased else ''}"
-    )
+    training = ", antialiased" if found.antialiased else ""
+    say(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}{training}")
     if found.offset:
         say(f"positions are relative to {' '.join(map(repr, found.offset))}")
-    say(f"up: {found.up_text}{'; --up names another axis' if found.up_is_guess else ''}")
+    say(f"up: {found.up_text}{'; --up sets another axis' if found.up_is_guess else ''}")
     if found.fill is not None:
         say(f"fill: {found.fill:.1f} Gaussians drawn per pixel, in {found.views}")
     if found.sh_energies:
         root = ", ".join(
             f"degree {index + 1}: {value**0.5:.3g}" for index, value in enumerate(found.sh_energies)
         )
-        say(f"what SH add to colours, root mean square: {root}")
+        say(f"SH contribution to colours, root mean square: {root}")
     for name, corners in (("all", found.bounds), ("middle 96 %", found.content)):
         if corners:
             low, high = (" ".join(f"{value:.4g}" for value in corner) for corner in corners)
@@ -133,7 +129,10 @@ def _print(found: SceneInfo) -> None:
     _bars("largest standard deviation, scene units, from", found.sizes)
     say(
         "suspicious: "
-        + (", ".join(f"{what} {n:,}" for what, n in found.suspicious.items()) or "nothing")
+        + (
+            ", ".join(f"{defect} {count:,}" for defect, count in found.suspicious.items())
+            or "nothing"
+        )
     )
 
 

@@ -1,4 +1,4 @@
-"""``pointsplat lod``: levels of detail."""
+"""``pointsplat lod``: make levels of detail."""
 
 from __future__ import annotations
 
@@ -29,36 +29,36 @@ def lod(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error
-    of each measured.
+    """Make levels of detail: merge the scene to fewer and fewer Gaussians in one pass, and measure
+    each level.
 
-    With --stream, the whole scene and these levels are written as a streamed SOG, of which viewers
-    load the parts that they need. With --tiles, they are written as 3D Tiles.
+    With --stream, the whole scene and the levels become a streamed SOG, from which viewers load
+    only the necessary parts. With --tiles, they become 3D Tiles.
 
-    Each level is merged from the one before, so that every Gaussian has one parent in the next
-    coarser level. Renders are compared with the dense scene's, from --poses, else from the poses of
-    the run's dataset if it is found, else from sampled poses.
+    Each level is merged from the previous one, so every Gaussian has one parent in the next coarser
+    level. Renders are compared with the dense scene's, in views from --poses, else from the run's
+    dataset, else in sampled views.
 
     Args:
         levels: sizes of the levels, in any order: ratios (0.3), percentages (30%), counts (50000)
-            or sizes of the file (12MB).
-        output: the folder for the levels (level_0.ply is the finest) and the manifest lod.json; by
+            or file sizes (12MB).
+        output: folder for the levels (level_0.ply is the finest) and the manifest lod.json; by
             default beside the scene: room_lod for room.ply, lod in the folder of a run. With
-            --stream, the folder for lod-meta.json and its SOG files, by default room_stream; with
-            --tiles, that for tileset.json and its glTF files, by default room_tiles. A name that
-            ends in .rad is a file for Spark.
+            --stream, folder for lod-meta.json and SOG files, by default room_stream; with --tiles,
+            folder for tileset.json and glTF files, by default room_tiles. A name that ends in .rad
+            is a file for Spark.
         stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its
             finest level.
         tiles: write 3D Tiles of glTF with SPZ (CesiumJS). The scene itself is their finest level.
-        at: where tiles lie on the Earth: the UTM zone of the scene's coordinates (EPSG:32632), or
-            the latitude, longitude and height of its origin in degrees and metres (48.86,2.29,35;
-            --at=-33.9,... in the south), with up turned to the zenith. By default they have the
+        at: place of the tiles on the Earth: UTM zone of the scene's coordinates (EPSG:32632), or
+            latitude, longitude and height of its origin in degrees and metres (48.86,2.29,35;
+            --at=-33.9,... in the south), with up rotated to the zenith. By default tiles keep the
             frame of the scene's file.
-        sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders
+        sh: SH bands of every level: all, a maximum degree, or auto, the lowest degree whose renders
             reach 40 dB.
         effort: length of the repair of each level, as for compact: none (instant), quick, or
             thorough.
-        json_output: print the manifest, and nothing else on standard output.
+        json_output: print the manifest and nothing else on standard output.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -104,7 +104,7 @@ def _print_table(made: Levels, folder: Path) -> None:
     from pointsplat_ns.system.files import bytes_text, three_digits
     from pointsplat_ns.tools.wording import impression
 
-    apart = (folder / FOLDER_FILES.levels).exists()  # each level has a PLY of its own
+    apart = (folder / FOLDER_FILES.levels).exists()  # every level has its own PLY
     rows = []
     for index, level in enumerate(made):
         near = level.quality

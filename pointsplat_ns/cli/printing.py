@@ -23,8 +23,8 @@ _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
 @contextmanager
 def only_json(args: list[str]) -> Iterator[None]:
-    """With ``--json`` in the arguments, only :func:`print_json` writes to standard output in this
-    context. All other output, also of libraries, goes to standard error."""
+    """With ``--json`` in the arguments, reserve standard output for :func:`print_json` in this
+    context. All other output, including that of libraries, goes to standard error."""
     if "--json" not in args:
         yield
         return
@@ -46,8 +46,8 @@ def print_json(content: Any) -> None:
 def scene_result(
     before: int | None, scene: Gaussians | PlyRows, seconds: float, where: Path
 ) -> dict[str, Any]:
-    """The JSON values of a result, from ``before`` Gaussians in the dense scene, if there is
-    one."""
+    """JSON values of a result. ``before`` is the count of the dense scene; None if there is
+    none."""
     return {
         "output": where,
         **({} if before is None else {"gaussians_before": before}),
@@ -68,20 +68,20 @@ def print_result(
     quality: Quality | None,
     in_parts: bool = False,
 ) -> None:
-    """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of
-    the file and time, and how close the file is to the dense scene, or why that is not known; a
-    scene that was merged ``in_parts`` does not fit into memory."""
+    """Print stages (the method, and ``also`` refined, repaired), counts, file size, duration, and
+    the quality against the dense scene, or the reason why it is unknown. A scene merged
+    ``in_parts`` does not fit into memory."""
     from pointsplat_ns.tools.wording import quality_text
 
     *first, last = [{"merge": "merged", "clean": "cleaned"}.get(by, f"pruned by {by}"), *also]
     done = f"{', '.join(first)} and {last}" if first else last
-    what = f"{done} to {len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
+    summary = (
+        f"{done} to {len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
+    )
     if len(scene) == before and not also:
-        nothing = {"merge": "nothing is merged", "clean": "nothing is removed"}.get(
-            by, "nothing is pruned"
-        )
-        what = f"{nothing}, all {before:,} Gaussians fit as they are"
-    say(f"{where}: {what}, {written_size(where)}, in {seconds_text(seconds)}")
+        verb = {"merge": "merged", "clean": "removed"}.get(by, "pruned")
+        summary = f"nothing is {verb}, all {before:,} Gaussians remain"
+    say(f"{where}: {summary}, {written_size(where)}, in {seconds_text(seconds)}")
     if quality is not None:
         say(quality_text(quality))
     elif in_parts:
@@ -91,14 +91,11 @@ def print_result(
 
 
 def print_if_larger(scene: Path, where: Path) -> None:
-    """Print a note if a result takes more bytes than the scene's file, whose format has fewer for
-    each Gaussian."""
+    """Print a note if the result is larger than the scene's file, which has a more compact
+    format."""
     if scene.is_file() and scene.suffix != ".yml" and scene.stat().st_size < where.stat().st_size:
-        remedy = (
-            ""
-            if scene.suffix == where.suffix
-            else f"; a name that ends in {scene.suffix} makes it smaller"
-        )
+        same_format = scene.suffix == where.suffix
+        remedy = "" if same_format else f"; a name that ends in {scene.suffix} makes it smaller"
         say(
             f"note: {where} is larger than {scene}: {written_size(where)}, not "
             f"{written_size(scene)}{remedy}"
@@ -106,15 +103,14 @@ def print_if_larger(scene: Path, where: Path) -> None:
 
 
 def psnr_text(psnr: float | None) -> str:
-    """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was
-    compared."""
+    """A PSNR in a table, dB: ``same`` for equal renders, a dash if not compared."""
     from pointsplat_ns.tools.wording import BEST_PSNR
 
     return "-" if psnr is None else "same" if psnr == math.inf else f"{min(psnr, BEST_PSNR):.1f}"
 
 
 def written_size(where: Path) -> str:
-    """Size of a scene's file, in words."""
+    """Size of a file as text."""
     from pointsplat_ns.system.files import bytes_text
 
     return bytes_text(where.stat().st_size)

@@ -31,18 +31,17 @@ def prune(
     verbose: options.Verbose = False,
     json_output: options.Json = False,
 ) -> None:
-    """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are
-    needed.
+    """Make a scene smaller: merge neighbours, or keep the most important Gaussians. Needs no
+    photos.
 
-    If anything has to be rendered, cameras are those of --poses, else those of the run's dataset;
-    if there are none, they are sampled.
+    Renders, if needed, use views from --poses, else from the run's dataset, else sampled views.
 
     Args:
-        output: the file to write; its name says the format: .ply, .spz, .sog or .splat. By
-            default in the scene's format and beside it: room_pruned.ply for room.ply, pruned.ply in
-            a run's folder.
-        memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs
-            more is merged in parts, with files beside the output; a command that was killed
+        output: file to write; its suffix sets the format: .ply, .spz, .sog or .splat. By default
+            beside the scene, in its format: room_pruned.ply for room.ply, pruned.ply in the folder
+            of a run.
+        memory: memory limit, such as 8GB; by default the free memory. A PLY that needs more is
+            merged in parts, with temporary files beside the output, from which a killed command
             resumes. With --jobs the limit applies to each process.
     """
     options.need_scenes(scene)

@@ -1,4 +1,4 @@
-"""``pointsplat render``: a film of one scene, or of two."""
+"""``pointsplat render``: film one scene, or two side by side."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ def render(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Film a scene, or two scenes side by side from the same cameras, on any machine.
+    """Film a scene, or two scenes side by side from the same cameras, with or without a GPU.
 
-    The film goes exactly through the poses; without poses around an object, or past what shows most
-    of a room.
+    The camera path passes exactly through the poses. Without poses, it circles an object, or walks
+    past the views that show most of a room.
 
     Args:
         other: a second scene in the same frame, to compare with.
-        output: .mp4 for a video; a folder for PNG frames, one for each pose of --poses unless
-            --seconds is given; or .png for the first frame alone. By default a video beside the
-            scene: room.mp4 for room.ply, render.mp4 in the folder of a run. It appears when it is
+        output: .mp4 for a video; a folder for PNG frames, one per pose of --poses unless --seconds
+            is given; or .png for only the first frame. By default a video beside the scene:
+            room.mp4 for room.ply, render.mp4 in the folder of a run. The output appears only when
             complete.
         width: width of one scene's picture, pixels; by default that of the photos, at most 960.
-        height: its height, pixels; by default in the proportion of the photos.
-        fps: frames a second.
-        seconds: length; by default 10, or long enough for every pose of the dataset.
+        height: height of one scene's picture, pixels; by default in the aspect ratio of the photos.
+        fps: frames per second.
+        seconds: length of the film; by default 10, or enough for every pose of the dataset.
     """
     options.need_scenes(scene, other)
     import pointsplat_ns as ps

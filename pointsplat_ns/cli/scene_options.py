@@ -1,5 +1,4 @@
-"""Arguments and output paths that several commands share, and how counts and sizes are read as
-people write them."""
+"""Arguments and output paths of several commands, and rules for tyro to parse counts and sizes."""
 
 from __future__ import annotations
 
@@ -34,11 +33,11 @@ Scenes = Annotated[
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 Options = TypeVar("Options")
 Flat = Annotated[Options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="", help="")]
-"""Options of a dataclass, without its name before theirs."""
+"""Options of a dataclass, without its name as a prefix."""
 
 
 def _paragraphs(documented: Any) -> dict[str, str]:
-    """The text on each parameter or field of a docstring, as one paragraph."""
+    """Description of each parameter or field in a docstring, as one paragraph."""
     return {
         part.arg_name: " ".join(part.description.split())
         for part in docstring_parser.parse_from_object(documented).params
@@ -47,7 +46,7 @@ def _paragraphs(documented: Any) -> dict[str, str]:
 
 
 def _field_docstrings(kind: type) -> dict[str, str]:
-    """The docstring of each field of a dataclass and its bases, as one paragraph."""
+    """Docstring of each field of a dataclass and its bases, as one paragraph."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
         found |= _paragraphs(base)
@@ -59,7 +58,7 @@ _COMMANDS = __name__.rpartition(".")[0]
 
 _VIEWS = _field_docstrings(ViewOptions)
 
-# For commands that take some of the ViewOptions.
+# For commands with some of the ViewOptions.
 Poses = Annotated[options.Poses, tyro.conf.arg(help=_VIEWS["poses"])]
 Resolution = Annotated[options.Resolution, tyro.conf.arg(help=_VIEWS["resolution"])]
 Up = Annotated[str | None, tyro.conf.arg(metavar="AXIS", help=_VIEWS["up"])]
@@ -72,24 +71,27 @@ Jobs = Annotated[
         help="for a folder: number of processes that share the work and the cores; by default 1."
     ),
 ]
-Verbose = Annotated[bool, tyro.conf.arg(help="print more: what was chosen for the scene.")]
+Verbose = Annotated[
+    bool, tyro.conf.arg(help="print details of the result and of choices for the scene.")
+]
 Json = Annotated[
     bool,
     tyro.conf.arg(
-        name="json", help="print the result as JSON, and nothing else on standard output."
+        name="json", help="print the result as JSON and nothing else on standard output."
     ),
 ]
 
 
-def output_beside(scene: Path, what: str, suffix: str | None = None) -> Path:
-    """The default path of a result, by default in the format of the scene's file. For a file, it is
-    beside it: ``room_pruned.ply`` for ``room.ply``. For a run, it is in its folder: ``pruned.ply``;
-    never in its checkpoint folder, because nerfstudio takes every file there for a checkpoint.
-    Nobody named it: a symbolic link there is not followed."""
+def output_beside(scene: Path, name: str, suffix: str | None = None) -> Path:
+    """The default path of a result, by default in the format of the scene.
+
+    The result of a file is beside it: ``room_pruned.ply`` for ``room.ply``. The result of a run is
+    in its folder: ``pruned.ply``; never in the folder of checkpoints, because nerfstudio takes all
+    files there for checkpoints. The path is automatic, so a symbolic link there is not followed."""
     from pointsplat_ns.scene.formats import format_like
     from pointsplat_ns.system.outputs import unnamed
 
-    name = f"{what}{format_like(scene).suffix if suffix is None else suffix}"
+    name = f"{name}{format_like(scene).suffix if suffix is None else suffix}"
     if scene.is_dir():
         return unnamed(scene / name)
     if scene.absolute().parent.name == "nerfstudio_models":
@@ -100,21 +102,20 @@ def output_beside(scene: Path, what: str, suffix: str | None = None) -> Path:
 
 
 def need_scenes(*paths: Path | None) -> None:
-    """Raise a SceneError, before torch is imported, that names all paths at which there is
-    nothing."""
+    """Raise a SceneError, before torch is imported, that lists all missing paths."""
     from pointsplat_ns.errors import SceneError
 
-    gone = []
+    missing = []
     for path in filter(None, paths):
         try:
             path.stat()
         except (FileNotFoundError, NotADirectoryError):
-            gone.append(str(path))
+            missing.append(str(path))
         except (OSError, ValueError):
-            pass  # the reader says more
-    if gone:
-        what = "no such file" if len(gone) == 1 else "no such files"
-        raise SceneError(f"{', '.join(gone)}: {what}; expected a scene: {ONE_SCENE}")
+            pass  # the reader raises a clearer error
+    if missing:
+        fault = "no such file" if len(missing) == 1 else "no such files"
+        raise SceneError(f"{', '.join(missing)}: {fault}; expected a scene: {ONE_SCENE}")
 
 
 def need_one_scene(path: Path) -> None:
@@ -124,16 +125,16 @@ def need_one_scene(path: Path) -> None:
 
     if is_folder_of_scenes(path):
         raise SceneError(
-            f"{path}: a folder without config.yml, so no run; expected {SCENE_KINDS}; compact and "
-            "info take a folder of scenes"
+            f"{path}: a folder without config.yml, so not a run; expected {SCENE_KINDS}; compact "
+            "and info accept a folder of scenes"
         )
 
 
 def check_outputs(
     scene: Path | None, force: bool, png: Path | None = None, html: Path | None = None
 ) -> None:
-    """Check the files that a command is going to write (a scene of any writable format, a picture,
-    a page) before its long computations. Raises SceneError if a path has another suffix, or as
+    """Check output files (a scene of any writable format, a picture, a page) before long
+    computations. Raises SceneError if a path has the wrong suffix, or as
     :func:`~pointsplat_ns.system.files.need_writable`."""
     from pointsplat_ns.scene.formats import format_to_write
     from pointsplat_ns.system.files import need_suffix, need_writable
@@ -148,7 +149,7 @@ def check_outputs(
 
 
 def check_poses(poses: Path | str | None) -> None:
-    """Raise a SceneError if a path cannot hold cameras because it is a run or a scene."""
+    """Raise a SceneError if ``poses`` is a run or a scene instead of a camera file."""
     if poses is None:
         return
     from pointsplat_ns.errors import SceneError
@@ -156,8 +157,8 @@ def check_poses(poses: Path | str | None) -> None:
 
     if not (str(poses) == NO_POSES or is_camera_file(poses)):
         raise SceneError(
-            f"{poses}: a run or a scene; expected {CAMERA_KINDS}; the poses of a run's own "
-            "dataset need no --poses"
+            f"{poses}: a run or a scene; expected {CAMERA_KINDS}; poses of a run's own dataset "
+            "need no --poses"
         )
 
 
@@ -178,9 +179,9 @@ Megabytes = Annotated[float, _spec("MB", parse_megabytes)]
 
 
 def quantities() -> ConstructorRegistry:
-    """A context in which tyro reads numbers as
-    :func:`~pointsplat_ns.system.quantities.parse_number` does, and refuses empty paths, which would
-    be the current folder: those of a script whose variable is not set."""
+    """A context in which tyro parses numbers by
+    :func:`~pointsplat_ns.system.quantities.parse_number`, and rejects empty paths (see
+    :func:`~pointsplat_ns.pipeline.options.parse_path`)."""
     registry = ConstructorRegistry()
     rules = {int: _spec("INT", parse_count), float: _spec("FLOAT", _float)}
 
@@ -194,7 +195,7 @@ def quantities() -> ConstructorRegistry:
 
     @registry.struct_rule
     def with_plain_help(info: StructTypeInfo) -> StructConstructorSpec | None:
-        """Commands and dataclasses of options, with the help of each option as one paragraph."""
+        """Commands and dataclasses of options, with the help of every option as one paragraph."""
         kind: Any = info.type
         if inspect.isfunction(kind) and kind.__module__.startswith(_COMMANDS):
             defaults = {
@@ -228,12 +229,14 @@ def quantities() -> ConstructorRegistry:
             for item in getattr(kinds[0], "__metadata__", ())
             if isinstance(item, PrimitiveConstructorSpec)
         ]
-        return own[0] if own else rules.get(kinds[0])  # of an optional number as of the number
+        return (
+            own[0] if own else rules.get(kinds[0])
+        )  # an optional number follows the rule of the number
 
     return registry
 
 
 def _float(text: str) -> float:
-    return (
-        float(text) if text.lower().lstrip("+-") in ("nan", "inf") else parse_number(text)
-    )  # commands refuse them
+    if text.lower().lstrip("+-") in ("nan", "inf"):
+        return float(text)  # commands reject it
+    return parse_number(text)

@@ -1,4 +1,4 @@
-"""``pointsplat tradeoff``: what a scene loses and gains when it gets smaller, measured."""
+"""``pointsplat tradeoff``: measure quality against speed and size of a scene."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ def tradeoff(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Measure how a scene trades quality for frame time, size and count, on this machine: each
-    method and repair at each budget. The figures are written as JSON, and as a page with pictures.
+    """Measure how a scene trades quality for frame time, size and count on this machine, for all
+    combinations of budgets, methods and repairs. Results are a JSON file, and a page with pictures.
 
     Args:
-        output: the folder for the results; by default beside the scene: room_tradeoff for room.ply,
+        output: folder for the results; by default beside the scene: room_tradeoff for room.ply,
             tradeoff in the folder of a run.
         keep: budgets: ratios (30%), counts (50000) or sizes (12MB).
-        within: largest loss of the recommended point against photos, dB. Without photos the loss is
-            estimated from renders.
-        by: methods of prune.
+        within: maximum loss of the recommended point against photos, dB. Without photos, the loss
+            is estimated from renders.
+        by: pruning methods, as for prune.
         repairs: repairs to try: none, compact's efforts quick and thorough, or its --photos.
-        views: largest number of views; without photos at most 12.
-        photos: folder of photos to judge by, where the scene is no run: every eighth, by name.
-            --poses names the file with their poses, or one is looked for.
+        views: maximum number of views; without photos at most 12.
+        photos: folder of photos to judge by, for a scene without a run: every eighth photo, by
+            name. Poses come from --poses, or from a camera file nearby.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -76,9 +76,8 @@ def tradeoff(
         say(f"note: {note}")
     say(found.why)
     best = found.point(found.recommended)
-    best = (
-        next_best(found.points) or best if best is found.points[0] else best
-    )  # the dense scene needs no command
+    if best is found.points[0]:  # the dense scene needs no command
+        best = next_best(found.points) or best
     if best is not found.points[0]:
         say(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
     if best.command:
@@ -87,7 +86,7 @@ def tradeoff(
 
 
 def _print_table(found: Tradeoff) -> None:
-    """The figures that matter most; the others are in the table on disk."""
+    """Print the most important figures; the JSON file has all."""
     from pointsplat_ns.system.files import three_digits
 
     photos = found.points[0].against_photos is not None
@@ -96,6 +95,7 @@ def _print_table(found: Tradeoff) -> None:
     say(found.machine)
     rows = []
     for point in found.points:
+        psnr_in_photos = point.against_photos.psnr if point.against_photos else None
         rows.append(
             (
                 point.label + (" *" if point.key == found.recommended else ""),
@@ -104,16 +104,12 @@ def _print_table(found: Tradeoff) -> None:
                 "{:.1f} ({:.1f}-{:.1f})".format(*point.speed),
                 three_digits(point.frame_ms),
                 f"{point.fill:.1f}",
-                *(
-                    [psnr_text(point.against_photos.psnr if point.against_photos else None)]
-                    if photos
-                    else []
-                ),
+                *([psnr_text(psnr_in_photos)] if photos else []),
                 psnr_text(point.against_dense.psnr),
                 f"{point.against_dense.ssim:.2f}",
             )
         )
-    columns = ["", "Gaussians", "MB", "times as fast", "ms a\nframe", "fill"]
+    columns = ["", "Gaussians", "MB", "times as fast", "ms per\nframe", "fill"]
     print_table(
         (*columns, *(["dB,\nphotos"] if photos else []), "dB,\ndense", "SSIM"),
         rows,

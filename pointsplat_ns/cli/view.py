@@ -1,4 +1,4 @@
-"""``pointsplat view``: scenes in the browser."""
+"""``pointsplat view``: view scenes in the browser."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def view(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> None:
-    """Look at a scene in the browser, or at two from the same camera. A slider keeps less of the
-    Gaussians, merged as `prune` does. The browser draws; it needs WebGL 2. Ctrl-C ends it.
+    """View a scene in the browser, or two from the same camera. A slider reduces the number of
+    Gaussians, merged as by `prune`. The browser renders with WebGL 2. Ctrl-C ends the viewer.
 
     Args:
         scene: a file of any format, a checkpoint, or a run (its folder or config.yml); by default
-            the page takes a file that is dropped on it.
-        other: a second scene in the same frame, to compare with; by default the first is compared
-            with all of itself.
-        host: the address to listen on; by default only this machine has access. With another
-            address, every machine that reaches it has access.
-        port: the first port to try; 0 takes any free port.
+            the page opens a dropped file.
+        other: a second scene in the same frame, to compare with; by default all Gaussians of the
+            first.
+        host: address to listen on; by default only this machine has access. With another address,
+            every machine in reach has access.
+        port: first port to try; 0 takes any free port.
     """
     options.need_scenes(scene, other)
     import pointsplat_ns as ps

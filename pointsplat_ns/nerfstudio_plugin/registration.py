@@ -50,7 +50,7 @@ def errors_in_one_line() -> None:
         else:
             before(kind, error, traceback)
             if hint := _export_hint(sys.argv):
-                print(hint, file=sys.stderr)
+                say(hint, error=True)
 
     sys.excepthook = print_error
 

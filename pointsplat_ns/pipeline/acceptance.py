@@ -1,8 +1,8 @@
-"""Accepts a change to a smaller scene, a refinement or a repair, or leaves it out.
+"""Accepts or rejects a change to a smaller scene: a refinement or a repair.
 
-The scene after it is compared with the scene before it. It is kept if it gains in whole pictures of
-a middle size, lowers the error in at least half of the views, and harms no picture of another size,
-or by little of what it gains.
+Renders before and after the change are compared with the dense scene. A change is accepted if PSNR
+rises in whole pictures of a middle size, error falls in at least half of the views, and PSNR in
+pictures of other sizes falls by at most a small share of the gain.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ from pointsplat_ns.system.progress import Progress, silent
 
 @dataclass(frozen=True)
 class AcceptanceSettings:
-    """Thresholds for keeping a change."""
+    """Thresholds for accepting a change."""
 
     min_gain: float = 0.1
-    """Least gain of PSNR, in dB: the sign of a smaller gain depends on the views."""
-    most_loss: float = 0.05
-    """Largest loss of PSNR, in dB, in pictures of another size."""
-    lost_share: float = 0.25
-    """The same as a share of the gain, if that is more: details smaller than a pixel look larger in
-    small pictures, so that no few Gaussians are right in all sizes."""
+    """Minimum gain of PSNR, dB. The sign of a smaller gain depends on the choice of views."""
+    max_loss: float = 0.05
+    """Maximum loss of PSNR in pictures of other sizes, dB."""
+    max_loss_share: float = 0.25
+    """The same as a share of the gain; the larger of both limits applies. Details below a pixel
+    look larger in small pictures, so few Gaussians cannot match all sizes at once."""
 
 
 ACCEPTANCE = AcceptanceSettings()
 
 SMALL_GAIN = Reason(Cause.SMALL_GAIN, decibels=ACCEPTANCE.min_gain)
-"""Why a change with a smaller gain is left out."""
+"""Reason to reject a change with a smaller gain."""
 
 
 class Comparison:
-    """Compares scenes with the dense scene: in whole pictures of a middle size, and in subsampled
-    pictures of the smallest size, of the full size, and of a larger size that stands for nearer
-    cameras.
+    """Compares scenes with the dense scene.
+
+    Pictures of a middle size are compared whole. Pictures of the smallest size, the full size and a
+    larger size, which stands for nearer cameras, are subsampled.
 
     Args:
         dense: N Gaussians, on the device that renders.
@@ -57,10 +58,10 @@ class Comparison:
         others = (sides[0], sides[-1], NEARER * sides[-1])
         self._others = RendersOfSizes(dense, whole, others) if len(sides) > 1 else None
 
-    def judged(
+    def judge(
         self, before: Closeness, old: Gaussians, new: Gaussians, progress: Progress = silent
     ) -> tuple[Closeness, Reason | None]:
-        """Errors of a changed scene, and why it is left out; None if it is accepted.
+        """Errors of a changed scene, and the reason to reject it; None if it is accepted.
 
         Args:
             before: errors of ``old``.
@@ -70,32 +71,32 @@ class Comparison:
         """
         end = new.to(self.device)
         after = self.reference.closeness(end, lambda share: progress("comparing renders", share))
-        reason = _why_no_gain(before, after)
+        reason = _rejection(before, after)
         if reason is None and self._others is not None:
-            lost = max(ACCEPTANCE.most_loss, ACCEPTANCE.lost_share * (after.psnr - before.psnr))
-            least = (psnr - lost for psnr in self._others.psnrs(old.to(self.device)))
-            if not all(
-                psnr >= bound for bound, psnr in zip(least, self._others.psnrs(end), strict=True)
-            ):  # NaN too
+            lost = max(ACCEPTANCE.max_loss, ACCEPTANCE.max_loss_share * (after.psnr - before.psnr))
+            bounds = (psnr - lost for psnr in self._others.psnrs(old.to(self.device)))
+            pairs = zip(bounds, self._others.psnrs(end), strict=True)
+            # ``not all``: a PSNR of NaN is rejected too.
+            if not all(psnr >= bound for bound, psnr in pairs):
                 reason = Reason(Cause.WORSE_IN_OTHER_SIZES)
         return after, reason
 
 
-def _why_no_gain(before: Closeness, after: Closeness) -> Reason | None:
-    """Why errors are no improvement; None if PSNR rises by :attr:`AcceptanceSettings.min_gain` or
-    more, and the error falls in at least half of the views. The second condition refuses a gain of
-    few views at the cost of the others."""
+def _rejection(before: Closeness, after: Closeness) -> Reason | None:
+    """Reason to reject a change; None if PSNR rises by :attr:`AcceptanceSettings.min_gain` or more,
+    and error falls in at least half of the views. The second condition rejects a gain in few views
+    at the cost of the others."""
     if after.errors == before.errors:
         return Reason(Cause.NO_CHANGE)
     if after.psnr <= before.psnr:
         return Reason(Cause.NO_GAIN)
     if not after.psnr >= before.psnr + ACCEPTANCE.min_gain:  # NaN too
         return SMALL_GAIN
-    if 2 * closer_in(before, after) < len(before.errors):
+    if 2 * views_improved(before, after) < len(before.errors):
         return Reason(Cause.WORSE_IN_MOST_VIEWS)
     return None
 
 
-def closer_in(before: Closeness, after: Closeness) -> int:
-    """Number of views with a smaller error after than before."""
+def views_improved(before: Closeness, after: Closeness) -> int:
+    """Number of views in which the error falls."""
     return sum(new < old for new, old in zip(after.errors, before.errors, strict=True))

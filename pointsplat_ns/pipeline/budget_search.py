@@ -1,8 +1,8 @@
-"""One search for all budgets without a formula: PSNR of renders, and size of a compressed file.
+"""Searches the count for budgets without a formula: PSNR of renders, size of a compressed file.
 
-Each measure rises with the number of Gaussians, nearly linearly in the logarithm of the number. So
-the next count is interpolated between a count below the target and one above it. As long as all
-tried counts lie on one side, it is extrapolated.
+Both measures rise nearly linearly with the logarithm of the count. The next count is interpolated
+between a count below the target and one above it, or extrapolated while all tried counts lie on one
+side.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.progress import silent
 
 SLOPE = 6.0
-"""Usual gain of merged scenes for each e-fold of the count, dB."""
+"""Typical gain of merged scenes per e-fold of the count, dB."""
 
-Made = TypeVar("Made")
+Candidate = TypeVar("Candidate")
 
 
 @dataclass(frozen=True, eq=False)
-class Found(Generic[Made]):
+class SearchResult(Generic[Candidate]):
     """The result of a search."""
 
-    best: Made | None
-    """What was made with the best count; None if all counts miss the target."""
+    best: Candidate | None
+    """Candidate of the best count; None if all counts miss the target."""
     tried: dict[int, float]
-    """The measure by count, for every count tried."""
+    """Measured value of every tried count."""
     interrupted: bool
     """Whether Ctrl-C ended the search."""
 
 
 def find_count(
-    measure: Callable[[int], tuple[float, Made]],
+    measure: Callable[[int], tuple[float, Candidate]],
     target: float,
     at_least: bool,
     first: int,
@@ -49,24 +49,22 @@ def find_count(
     tolerance: float,
     tries: float = math.inf,
     stoppable: bool = False,
-) -> Found[Made]:
-    """Search for nearly the smallest count whose measure reaches the target, or nearly the largest
-    whose measure does not exceed it. Of the counts tried, the best one that meets the target is
-    found.
+) -> SearchResult[Candidate]:
+    """Search for nearly the smallest count that reaches a target, or nearly the largest that does
+    not exceed it. The result is the best of the tried counts that meet the target.
 
     Args:
-        measure: from a count to a number that rises with it, and what was made with the count. It
-            is called once for each count tried.
-        target: the number to reach, or not to exceed.
-        at_least: whether the measure has to reach the target; if not, it must not exceed it.
-        first: the first count tried.
-        most: largest count.
-        slope: usual rise of the measure for each e-fold of the count.
-        tolerance: distance from the target at which a count that meets it is good enough. So is one
+        measure: returns a value that rises with the count, and the candidate of that count. It is
+            called once per tried count.
+        target: value to reach, or not to exceed.
+        at_least: True to reach the target; False not to exceed it.
+        first: first count to try.
+        most: maximum count.
+        slope: typical rise of the value per e-fold of the count.
+        tolerance: the search ends with a count that meets the target and is this close to it, or
             within 5 % of a count that misses it.
-        tries: largest number of counts tried, once one has met the target.
-        stoppable: whether Ctrl-C ends the search with the best so far, if a count has met the
-            target.
+        tries: maximum number of tried counts, once one meets the target.
+        stoppable: whether Ctrl-C ends the search with the best candidate so far, if any.
 
     Example:
         >>> found = find_count(lambda k: (k / 10, k), 42.0, True, first=1000, most=1000, slope=42.0, tolerance=1.0)
@@ -74,32 +72,31 @@ def find_count(
         True
     """
     aimed = target + (0.5 if at_least else -0.5) * tolerance
-    # counts below the target, and at or above it; out of bounds until measured
+    # Largest count below the target, smallest count at or above it; out of bounds until measured.
     low = 0
     high = most + 1
     values: dict[int, float] = {}
-    best: tuple[int, Made] | None = None
+    best: tuple[int, Candidate] | None = None
     count = min(max(first, 1), most)
     while True:
         try:
-            value, made = measure(count)
+            value, candidate = measure(count)
         except KeyboardInterrupt:
             if best is None or not stoppable:
                 raise
-            return Found(best[1], values, True)
+            return SearchResult(best[1], values, True)
         values[count] = value
         below = value < target if at_least else value <= target
         low, high = (count, high) if below else (low, count)
         if below != at_least:
-            best = count, made
+            best = count, candidate
         good_enough = best is not None and best[0] == count and abs(value - target) <= tolerance
         close = best is not None and high <= max(low, 1) * 1.05
         if good_enough or close or high - low <= 1 or (best is not None and len(values) >= tries):
-            return Found(None if best is None else best[1], values, False)
+            return SearchResult(None if best is None else best[1], values, False)
         guess = _guess(values, aimed, slope)
-        if (
-            low in values and high in values
-        ):  # apart from both, so that each try narrows the interval
+        if low in values and high in values:
+            # Away from both ends, so that each try narrows the interval.
             guess = min(low * (high / low) ** 0.85, max(low * (high / low) ** 0.15, guess))
         elif guess * 1.05 > most and most not in values:
             guess = most
@@ -107,9 +104,9 @@ def find_count(
 
 
 def _guess(values: dict[int, float], aimed: float, slope: float) -> float:
-    """The count where the line through the two measured counts nearest to ``aimed`` reaches it;
-    with one count, or if the measure falls between them, a line of the usual slope. It is at most
-    16 times as far as the nearest."""
+    """Count at which the line through the two nearest measured values reaches ``aimed``.
+
+    With one count, or where the value falls between the two, the line has the typical slope. The count differs from the nearest one by at most a factor of 16."""
     nearest = sorted(
         (count for count in values if math.isfinite(values[count])),
         key=lambda n: abs(values[n] - aimed),
@@ -118,42 +115,39 @@ def _guess(values: dict[int, float], aimed: float, slope: float) -> float:
         return min(values) / 4
     if len(nearest) > 1:
         fewer, more = sorted(nearest[:2])
-        found = (values[more] - values[fewer]) / math.log(more / fewer)
-        slope = found if found > 0 else slope
+        measured = (values[more] - values[fewer]) / math.log(more / fewer)
+        slope = measured if measured > 0 else slope
     step = (aimed - values[nearest[0]]) / slope
     return nearest[0] * math.exp(min(max(step, -math.log(16.0)), math.log(16.0)))
 
 
 def share_done(tries: float) -> float:
-    """Share done of a search after some tries, of which there are about four. It never jumps."""
+    """Progress of a search after some tries, in [0, 1). A search takes about four."""
     return 1 - 0.75**tries
 
 
 @dataclass(frozen=True)
 class FileLimit:
-    """A limit of the size of a compressed file, and how far the numbers of its scene are rounded to
-    meet it."""
+    """Maximum size of a compressed file, and the rounding of its values that meets it."""
 
     kind: Format
     """A format with ``encode``."""
     most: float
-    """Bytes; inf for a rounding without a limit."""
+    """Maximum size, bytes; inf for rounding without a limit."""
     rounding: float | None = None
-    """That of :func:`rounding_for` for a scene of this quality; None for none, as long as the file
-    meets the limit."""
+    """Rounding step from :func:`rounding_for`; None to round only if the file exceeds the limit."""
 
     def bytes_of(self, scene: Gaussians) -> int:
-        """Bytes of a scene's file, without unusable Gaussians."""
+        """Size of the scene's file without unusable Gaussians, bytes."""
         assert self.kind.encode is not None
-        return len(self.kind.encode(_as_written(scene), silent))
+        return len(self.kind.encode(_usable_on_cpu(scene), silent))
 
     def rounded(self, scene: Gaussians) -> Gaussians:
-        """A scene rounded so that its file meets the limit, on its device: coarser if the file is
-        too large, finer if there is room. If no rounding that is tried meets it, the last is
-        returned."""
+        """The scene, rounded until its file meets the limit: coarser if the file is too large,
+        finer if there is room. If no tried rounding meets it, the last one is returned."""
         if self.kind.rounded is None:
             return scene
-        written = _as_written(scene)
+        written = _usable_on_cpu(scene)
         rounding = self.rounding
         if rounding is None:
             if self.most == math.inf or self.bytes_of(written) <= self.most:
@@ -162,7 +156,7 @@ class FileLimit:
         best = tried = self.kind.rounded(written, rounding)
         if self.most == math.inf:
             return best.to(scene.device)
-        # steps finer: those tried, the most that fit, the next
+        # number of finer steps: current, largest that fits, smallest that exceeds
         steps = 0.0
         fits = -math.inf
         exceeds = math.inf
@@ -182,35 +176,34 @@ class FileLimit:
         return (best if fits > -math.inf else tried).to(scene.device)
 
 
-def _as_written(scene: Gaussians) -> Gaussians:
+def _usable_on_cpu(scene: Gaussians) -> Gaussians:
     scene = scene.detach().to("cpu", torch.float32)
     return scene[scene.usable()]
 
 
 def smallest_within(
     n: int,
-    measure: Callable[[int], tuple[float, Made]],
+    measure: Callable[[int], tuple[float, Candidate]],
     psnr: float,
     stoppable: bool = False,
     first: float = 0.3,
     slope: float = SLOPE,
-) -> tuple[Made, Found[Made]]:
-    """Search for the smallest scene of a method that reaches ``psnr``, dB. A smaller such scene may
-    exist where PSNR does not always rise with the count.
+) -> tuple[Candidate, SearchResult[Candidate]]:
+    """Search for the smallest scene that reaches ``psnr``, dB. A smaller one may exist where PSNR
+    does not always rise with the count.
 
     Args:
         n: number of Gaussians of the dense scene.
-        measure: from a count, at most n, to the PSNR of a scene against the dense one, dB, and what
-            was made.
-        psnr: to be reached, dB, above 0.
+        measure: returns the PSNR against the dense scene, dB, and the candidate of a count in 1..n.
+        psnr: PSNR to reach, dB, above 0.
         stoppable, slope: as for :func:`find_count`.
-        first: share of n that is tried first.
+        first: first share of n to try.
 
     Returns:
-        What was made with the best count, and the search.
+        Candidate of the best count, and the search.
 
     Raises:
-        BudgetError: if not even n Gaussians reach it.
+        BudgetError: if all n Gaussians miss it.
     """
     found = find_count(
         measure, psnr, True, max(1, round(first * n)), n, slope, tolerance=0.1, stoppable=stoppable
@@ -229,31 +222,29 @@ def largest_within(
     progress: Callable[[float], None],
     psnr_of: Callable[[Gaussians], float] | None = None,
 ) -> tuple[Gaussians, FileLimit, int]:
-    """Search for the largest scene of a method whose file meets a limit. The numbers of each scene
-    are rounded by its PSNR, unless all Gaussians fit without. Each try makes a scene, so tries are
-    few, and 95 % of the limit are enough.
+    """Search for the largest scene whose file meets a limit.
+
+    The values of each scene are rounded by its PSNR, unless all Gaussians fit unrounded. Each try makes a scene, so the search stops early: at 95 % of the limit.
 
     Args:
         full: the largest scene.
         make: ``make(n)`` returns n Gaussians, fewer than ``full`` has.
-        limit: of the file, without rounding.
+        limit: limit of the file, without rounding.
         progress: called with the share done.
-        psnr_of: gives the PSNR of a scene, dB; None where there are no views: it is then taken to
-            be 30 dB.
+        psnr_of: returns the PSNR of a scene, dB; None without views, which assumes 30 dB.
 
     Returns:
-        The scene before its numbers are rounded; the limit with a rounding that meets it; and the
-        number of tries.
+        The unrounded scene, the limit with a rounding that meets it, and the number of tries.
 
     Raises:
-        BudgetError: if not even one Gaussian fits.
+        BudgetError: if one Gaussian is too large.
     """
     n = len(full)
     numbers = itertools.count(1)
 
     def measure(count: int) -> tuple[float, tuple[Gaussians, FileLimit]]:
         scene = full if count == n else make(count)
-        written = _as_written(scene)
+        written = _usable_on_cpu(scene)
         found = limit
         if limit.kind.rounded is not None:
             psnr = rounding_psnr(psnr_of(scene) if psnr_of else 30.0, count / n)
@@ -261,12 +252,8 @@ def largest_within(
             written = limit.kind.rounded(written, rounding)
             found = replace(limit, rounding=rounding)
         size = limit.bytes_of(written)
-        if (
-            size <= limit.most
-            and count == n
-            and found.rounding
-            and limit.bytes_of(full) <= limit.most
-        ):
+        fits = size <= limit.most
+        if fits and count == n and found.rounding and limit.bytes_of(full) <= limit.most:
             found = limit
         progress(share_done(next(numbers)))
         return math.log(size), (scene, found)
@@ -284,11 +271,15 @@ def largest_within(
 
 
 def rounding_psnr(psnr: float, share: float) -> float:
-    """PSNR that sets the rounding of a scene's numbers, dB.
+    """PSNR that decides how far a smaller scene is rounded, dB.
 
-    The scene has ``share`` of the Gaussians and a PSNR of ``psnr``, dB. Its squared error of merging
-    is modelled as A (share^-p - 1): it falls by ``SLOPE`` per e-fold of a small count, and to 0 for
-    all Gaussians. Near the full count, another Gaussian gains more, so rounding may cost more: at
-    the best division of bytes, its error is a share of A share^-p, the error of few Gaussians.
+    The squared error of merging is modelled as A (share^-p - 1): it falls by ``SLOPE`` per e-fold
+    of a small count, and is 0 for all Gaussians. One more Gaussian gains more, the closer the count
+    is to all, so coarser rounding pays off. At the best division of bytes, the error of rounding is
+    a share of A share^-p, the error of a small count.
+
+    Args:
+        psnr: PSNR of the smaller scene against the dense scene, dB.
+        share: share of the Gaussians that remain, in (0, 1].
     """
     return psnr + 10 * math.log10(1 - share ** (SLOPE * math.log(10) / 10)) if share < 1 else psnr

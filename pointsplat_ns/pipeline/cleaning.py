@@ -1,14 +1,14 @@
-"""Finds the Gaussians of a scene that no picture needs, so that a budget is spent on the others.
+"""Finds Gaussians that no picture needs, so that a budget is spent on the others.
 
-Three rules remove a Gaussian. The first: it cannot be drawn, because a value is NaN or infinite, or
-because it is fainter than the rasterizer draws. The second: no camera sees it. Cameras stand at the
-likeliest places and look in all directions; a Gaussian is unseen if it has no blend weight (its
-opacity at a pixel times the transmittance in front of it) on any pixel of any image. So a visible
+Three rules remove a Gaussian. First: it cannot be drawn, because a value is NaN or infinite, or its
+opacity is below the rasterizer's threshold. Second: no camera sees it. Cameras stand at the
+likeliest places and look in all directions. A Gaussian is unseen if its blend weight (opacity at a
+pixel times transmittance in front of it) is zero on every pixel of every image. A visible
 background stays, and so does a lamp that hangs in the air.
 
-The third has a strength, and is off where that is 0: a Gaussian floats if it stands far before what
-views show, and pictures hardly change without it (:func:`floating_scores`). So haze goes, and a cup
-before a wall stays, whose colour pictures need.
+Third: it floats. A floater stands far in front of the visible surfaces, and pictures hardly change
+without it (:func:`floating_scores`). A strength of 0 turns this rule off. Haze goes; a cup in front
+of a wall stays, because pictures need its colour.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ from pointsplat_ns.view_sampling.content import content_size, in_units
 from pointsplat_ns.view_sampling.sampler import Sampler
 
 PLACES = 16
-"""Number of places of cameras: more remove less and take longer."""
+"""Number of camera positions. More positions remove fewer Gaussians and take longer."""
 
 FLOATING = 0.25
-"""Largest difference in colour, root of the sum of squares of red, green and blue, of a Gaussian
-that floats right before the camera at a strength of 1. At half the strength, held-out photos lose
-at most 0.05 dB on average (``python -m lab.judge.cleaning RUN``)."""
+"""Maximum colour difference (root of the sum of squares of red, green and blue) of a floater right
+in front of the camera, at a strength of 1. At half the strength, held-out photos lose at most 0.05
+dB on average (``python -m lab.judge.cleaning RUN``)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Junk:
-    """The Gaussians of a scene that no picture needs."""
+    """Gaussians that no picture needs."""
 
     undrawable: Tensor  # [A] int64, unusable Gaussians first, then by rising opacity
     unseen: Tensor  # [B] int64, by rising opacity
-    floating: Tensor  # [C] int64, the nearest before what views show first
+    floating: Tensor  # [C] int64, by rising floating score
     places: int
-    """Number of places of cameras; 0 if nothing is visible, and no Gaussian is unseen then."""
+    """Number of camera positions; 0 if nothing is visible, in which case no Gaussian is unseen."""
 
     def first(self, count: int) -> Junk:
         """The first ``count``: undrawable Gaussians, then unseen ones, then floating ones."""
@@ -86,18 +86,18 @@ class RuleEffect:
     removed: int
     """Number of Gaussians that this rule removes."""
     places: int = 0
-    """Number of places of cameras, for unseen Gaussians; 0 if there was no place to look from."""
+    """Number of camera positions, for unseen Gaussians; 0 if there was none."""
     clusters: int = 0
     """Number of clusters of floating Gaussians."""
     seen_in: int = 0
-    """Number of views that tell what floats."""
+    """Number of views that decide which Gaussians float."""
     psnr: float | None = None
-    """PSNR of renders without what was removed so far, dB; inf if nothing differs, None if nothing
-    was compared."""
+    """PSNR of renders after this rule and those before it, dB; inf for equal renders, None if not
+    compared."""
     worst: float | None = None
     """The same of the worst view, dB."""
     views: int = 0
-    """Number of the compared views."""
+    """Number of compared views."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +111,8 @@ class Cleaning:
     """What each rule removes; empty if nothing is removed."""
 
     def apply(self, scene: Gaussians, at_least: int) -> Gaussians:
-        """The scene as read, perhaps with fewer SH bands, without its junk. The most opaque junk
-        stays where fewer than ``at_least`` Gaussians would remain."""
+        """Remove the junk from the scene as read, or from a copy with fewer SH bands. The most
+        opaque junk stays where fewer than ``at_least`` Gaussians would remain."""
         return _without(scene, self.junk.first(self.count - at_least).indices)
 
 
@@ -123,16 +123,26 @@ def find_junk(
     floating: Views | None = None,
     strength: float = 0,
 ) -> Junk:
-    """Find the Gaussians that cannot be drawn, those that no camera sees, and with a strength those
-    that float in the views ``floating``, which are cameras, too: indices on the CPU. All are junk
-    if none can be drawn. The result is deterministic, and but for rounding does not depend on the
-    unit of length."""
+    """Find undrawable, unseen and, with a strength, floating Gaussians.
+
+    The result is deterministic and, up to rounding, independent of the unit of length. If no
+    Gaussian can be drawn, all are junk.
+
+    Args:
+        scene: N Gaussians.
+        progress: called with the name of the current task and the share done, in [0, 1].
+        floating: views that decide which Gaussians float; a Gaussian visible in them is not unseen.
+        strength: strength of the third rule, in [0, 1].
+
+    Returns:
+        Indices, on the CPU.
+    """
     usable = scene.usable()
     drawable = usable & (scene.alphas >= ALPHA_MIN)
     order = torch.where(usable, scene.alphas, -1.0).sort(stable=True).indices
     undrawable = order[~drawable[order]]
     drawn = drawable.nonzero()[:, 0]
-    visible = ~drawable  # so that no undrawable Gaussian is counted as unseen too
+    visible = ~drawable  # an undrawable Gaussian does not count as unseen too
     places = 0
     if len(drawn):
         part = scene[drawn]
@@ -160,13 +170,15 @@ def find_junk(
 def floating_scores(
     scene: Gaussians, views: Views, progress: Progress = silent
 ) -> tuple[Tensor, Tensor]:
-    """How little a Gaussian floats, (N,) float64, infinite where no view shows it before something
-    else; and whether any view shows it, (N,).
+    """Floating score (N,) float64 of each Gaussian, and whether any view shows it, (N,) bool.
 
-    Over all pixels of all views, and weighted by the Gaussian's blend weights, let r be the mean of
-    its depth divided by the depth of the picture, and d the mean squared difference of its colour
-    (without SH) from that of the picture, summed over red, green and blue; d is at least 0.01
-    squared. The score is ``sqrt(d / (1 - r)) / FLOATING``.
+    A low score marks a floater. It is infinite where no view shows the Gaussian in front of
+    something else.
+
+    Let r be the mean of the Gaussian's depth divided by the picture's depth, and d the mean squared
+    difference of its colour (without SH) from the picture's, summed over red, green and blue, and
+    at least 0.01 squared. Means are over all pixels of all views, weighted by blend weights. The
+    score is ``sqrt(d / (1 - r)) / FLOATING``.
     """
     totals = torch.zeros(len(scene), 3, **DOUBLES).to(scene.device)
     for done, sums in enumerate(each_view(scene, views, _seen_through)):
@@ -179,19 +191,15 @@ def floating_scores(
 
 
 def _seen_through(scene: Gaussians, view: View) -> Tensor:
-    """Sums (N, 3) over the pixels of a view of blend weights, of these times the Gaussian's depth
-    by the picture's, and times the squared difference of their colours; float64."""
+    """Sums (N, 3) float64 over the pixels of a view: blend weights; blend weights times the ratio
+    of the Gaussian's depth to the picture's; blend weights times the squared colour difference."""
     picture = render(scene, view)
-    (depth, _) = render_depth(scene, view)
+    depth, _ = render_depth(scene, view)
     closeness = torch.where(depth > 0, 1 / depth, 0.0)
-    pixels, near = (
-        pixel_sums(scene, view, torch.stack([torch.ones_like(depth), closeness], -1))
-        .double()
-        .unbind(1)
-    )
-    shown = pixel_sums(
-        scene, view, torch.cat([picture, picture.square().sum(-1, keepdim=True)], -1)
-    ).double()
+    ones_and_closeness = torch.stack([torch.ones_like(depth), closeness], -1)
+    pixels, near = pixel_sums(scene, view, ones_and_closeness).double().unbind(1)
+    colours_and_squares = torch.cat([picture, picture.square().sum(-1, keepdim=True)], -1)
+    shown = pixel_sums(scene, view, colours_and_squares).double()
     toward = view.viewmat[2].to(scene.device, torch.float64)
     depths = scene.means.double() @ toward[:3] + toward[3]
     colors = (0.5 + SH_C0 * scene.features_dc.double()).clamp(0, 1)
@@ -200,8 +208,8 @@ def _seen_through(scene: Gaussians, view: View) -> Tensor:
 
 
 def clusters(scene: Gaussians) -> Tensor:
-    """The cluster (N,) int64 of each of N drawable Gaussians, from 0, the largest first. Gaussians
-    whose spheres of two standard deviations touch are in one cluster."""
+    """Cluster index (N,) int64 of each of N drawable Gaussians; cluster 0 is the largest. Gaussians
+    whose spheres of two standard deviations touch share a cluster."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -224,9 +232,11 @@ def clean_scene(
     progress: Progress = silent,
     strength: float | None = None,
 ) -> Cleaning:
-    """Find the junk of a scene, and measure the PSNR of renders without it. Views decide what
-    floats, if there is a strength, and what they show is not unseen; sampled ones decide nothing
-    without a strength. At least ``at_least`` Gaussians, in 1..N, remain."""
+    """Find the junk of a scene, and measure the PSNR of renders without it.
+
+    With a strength, views decide which Gaussians float. A Gaussian that known views show is not
+    unseen; sampled views count only with a strength. At least ``at_least`` Gaussians, in 1..N,
+    remain."""
     floating = None
     with suppress(DataError):  # no views
         if strength is not None or views.known(1) is not None:
@@ -266,34 +276,33 @@ def clean_scene(
 
 
 def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
-    """The scene without the Gaussians at some indices; the others keep their order."""
+    """The scene without the Gaussians at the given indices; the others keep their order."""
     if len(indices) == 0:
         return scene
-    kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
-    kept[indices.to(scene.device)] = False
-    return scene[kept]
+    remaining = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
+    remaining[indices.to(scene.device)] = False
+    return scene[remaining]
 
 
 def _views_all_around(scene: Gaussians) -> Views:
-    """Views in six directions from the places of the likeliest views, six in a row for each place.
-    Raises DataError if nothing is visible."""
-    # Without SH, so that places do not depend on where photos were taken.
+    """Views in six directions from each of the likeliest camera positions, (6 P). Raises DataError
+    if nothing is visible."""
+    # Without SH: positions must not depend on where photos were taken.
     without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
-    # few of the likeliest are behind walls; views for comparisons have another seed
+    # Few of the likeliest views are behind walls. Views for comparisons use another seed.
     views = Sampler(without_sh).views(PLACES, seed=17, likeliest=True)
     places = invert_rigid(views.viewmats)[:, :3, 3]
     forward = torch.cat([torch.eye(3, **DOUBLES), -torch.eye(3, **DOUBLES)])
     right = forward.roll(1, dims=1)
-    rotations = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1).to(
-        places
-    )  # OpenCV axes
+    down = torch.linalg.cross(forward, right)
+    rotations = torch.stack([right, down, forward], dim=1).to(places)  # OpenCV axes
     viewmats = torch.eye(4, **FLOATS).to(places).repeat(len(places), 6, 1, 1)
     viewmats[..., :3, :3] = rotations
     viewmats[..., :3, 3] = -torch.einsum("dij,pj->pdi", rotations, places)
-    # A side hardly changes the time. A coarse image shows more small Gaussians, as none is drawn
-    # thinner than a pixel.
+    # The size hardly changes the time. A coarse image shows more small Gaussians, because none is
+    # drawn thinner than a pixel.
     side = 32  # pixels
-    half = side / 2  # a field of view of 90 degrees
+    half = side / 2  # focal length of a field of view of 90 degrees
     K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]], **FLOATS)
     viewmats = viewmats.flatten(0, 1)
     return Views(viewmats, K.repeat(len(viewmats), 1, 1), side, side, torch.zeros(3, **FLOATS))

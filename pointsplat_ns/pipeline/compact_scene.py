@@ -1,7 +1,7 @@
-"""Compacts a scene in stages: prune, refine, repair, and round for a file of limited size.
+"""Compacts a scene in stages: prune, refine, repair, round for a file of limited size.
 
-Refinement and repair are accepted by comparing renders with those of the dense scene. For a quality
-after all stages, counts are searched.
+Refinement and repair are accepted by comparing renders with the dense scene's. For a target quality
+after all stages, the count is searched for.
 """
 
 from __future__ import annotations
@@ -40,12 +40,13 @@ def compact_scene(
 ) -> Report:
     """Make a scene smaller, refine it if there is a refiner, and repair it.
 
-    With ``photos``, and a budget for it, the scene is trained on them, and repaired only where that
-    harms: a repair before brings nothing (a tenth of fox, figure, ray and vr_project: within 0.1 dB
-    in held-out photos, and within 0.2 dB in sampled views), unless the scene is large.
+    With ``photos`` and a budget for them, the scene is trained on photos. It is repaired only if
+    the training harms it: a repair before the training gains nothing (a tenth of fox, figure, ray
+    and vr_project: within 0.1 dB in held-out photos and 0.2 dB in sampled views), unless the scene
+    is large.
 
-    A requested PSNR (``auto``) is reached before refinement, so that it holds in any case. The
-    repair uses other views than the comparison.
+    Pruning alone reaches a requested PSNR (``auto``), so it holds whether or not later stages are
+    accepted. Repair and comparison use different views.
 
     Args:
         dense: N Gaussians.
@@ -54,11 +55,11 @@ def compact_scene(
         progress: called with the name of the current task and the share of it that is done, in [0,
             1].
         photos: photos to train on.
-        refiner: the network; scenes are computed on its device.
-        state_file: file of the state of a long repair, from which it continues.
+        refiner: trained network; its device computes all stages.
+        state_file: file with the state of a long repair, from which a killed command continues.
 
     Returns:
-        The result. Its scenes are on the device of ``dense``.
+        The result. Scenes are on the device of ``dense``.
 
     Raises:
         BudgetError, SceneError, PointSplatError: as
@@ -69,16 +70,16 @@ def compact_scene(
     start = time.perf_counter()
     options.check_sh_degree(dense, refiner)
     views = views or ViewProvider(dense)
-    at_work = dense.to(default_device() if refiner is None else refiner.device)
-    pruned = prune_scene(at_work, options, views, progress, rounding=False)
+    dense_on_device = dense.to(default_device() if refiner is None else refiner.device)
+    pruned = prune_scene(dense_on_device, options, views, progress, rounding=False)
     comparison = None
     uncompared = ""
     try:
         progress("comparing renders", 0.0)
-        comparison = Comparison(at_work, views)
+        comparison = Comparison(dense_on_device, views)
     except DataError as error:
         uncompared = str(error)
-    context = Context(at_work, views, comparison, uncompared, progress)
+    context = Context(dense_on_device, views, comparison, uncompared, progress)
     reference = context.reference
     results = [
         StageResult(
@@ -118,8 +119,8 @@ def _repaired(
     photos: Photos | None,
     state_file: Path | None,
 ) -> list[StageResult]:
-    """The repair of the last accepted stage, or the training on photos; both for large scenes, and
-    where training harms photos outside of its steps."""
+    """Repair the last accepted stage, or train it on photos. Both run for large scenes, and where
+    training harms photos outside of its steps."""
     repair = Repair(options.repair, state_file)
     budget = options.photo_budget
     if photos is None or budget is None or budget.empty:
@@ -136,7 +137,7 @@ def _repaired(
         return [trained]
     repaired = repair.run(last, context)
     if repaired.accepted:
-        trained = training.beside(trained, repaired, context)
+        trained = training.against(trained, repaired, context)
     return [repaired, trained]
 
 
@@ -149,17 +150,17 @@ def compact_to_quality(
     held_out: Photos = (),
     refiner: TrainedRefiner | None = None,
 ) -> Report:
-    """:func:`compact_scene` with the fewest Gaussians that reach ``target_db`` of the options, or
-    lose at most ``most_lost`` in the held-out photos, in place of a budget.
+    """:func:`compact_scene` with the fewest Gaussians that reach a quality, in place of a budget.
 
-    Each count is judged after writing and reading the scene in the format of the options: as every
-    command judges (:mod:`~pointsplat_ns.pipeline.quality`), or in the photos. Ctrl-C ends the
-    search with the smallest scene found so far, if any.
+    The quality is ``target_db`` of the options, judged as by every command
+    (:mod:`~pointsplat_ns.pipeline.quality`), or a loss of at most ``most_lost`` in held-out photos.
+    Each candidate is judged after writing and reading it in the target format. Ctrl-C ends the
+    search with the smallest scene that reaches the quality so far, if any.
 
     Raises:
-        BudgetError: if not even all Gaussians reach it.
+        BudgetError: if all Gaussians miss it.
         SceneError, PointSplatError: as :func:`compact_scene`.
-        DataError: if there are no views, or no held-out photos where these judge.
+        DataError: if there are no views, or no held-out photos to judge by.
     """
     start = time.perf_counter()
     suffix = options.target_format
@@ -167,45 +168,46 @@ def compact_to_quality(
     judge = Judge(dense, views)
     kind = format_to_write(suffix)
     device = default_device() if refiner is None else refiner.device
-    every = [*range(len(held_out))]
-    known = 0.0
+    photo_indices = [*range(len(held_out))]
+    dense_psnr = 0.0
     if options.most_lost is not None:
-        if not every:
+        if not photo_indices:
             raise DataError(
-                "there are no held-out photos, in which --keep auto judges; expected a budget, "
-                "such as 10%"
+                "there are no held-out photos for --keep auto to judge by; expected a budget, such "
+                "as 10%"
             )
-        known = mean_psnr(dense.to(device), held_out, every)
+        dense_psnr = mean_psnr(dense.to(device), held_out, photo_indices)
 
     def measure(count: int) -> tuple[float, Report]:
-        asked = replace(options, keep=count)
+        sized = replace(options, keep=count)
         report = within(f"size {next(numbers)}", progress)
-        made = compact_scene(dense, asked, views, report, photos, refiner)
-        if made.interrupted:
+        candidate = compact_scene(dense, sized, views, report, photos, refiner)
+        if candidate.interrupted:
             raise KeyboardInterrupt
-        if kind.rounded is not None and (psnr := judge.psnr(made.scene)[0]) <= ROUNDING.best_psnr:
-            limit = FileLimit(kind, math.inf, rounding_for(psnr, made.scene.sh_degree))
-            result = rounded(made.last, limit, made.reference)
-            if result is not made.last:
-                made = replace(made, stages=(*made.stages, result))
-        written_bytes, written = through_file(made.scene, suffix)
+        psnr = math.inf if kind.rounded is None else judge.psnr(candidate.scene)[0]
+        if kind.rounded is not None and psnr <= ROUNDING.best_psnr:
+            limit = FileLimit(kind, math.inf, rounding_for(psnr, candidate.scene.sh_degree))
+            result = rounded(candidate.last, limit, candidate.reference)
+            if result is not candidate.last:
+                candidate = replace(candidate, stages=(*candidate.stages, result))
+        written_bytes, written = through_file(candidate.scene, suffix)
         if options.most_lost is None:
             psnr, _ = judge.psnr(written)
         else:
-            psnr = mean_psnr(written.to(device), held_out, every)
+            psnr = mean_psnr(written.to(device), held_out, photo_indices)
         target = TargetSearch(
             psnr=psnr,
             bytes=written_bytes,
-            gaussians=len(made.scene),
-            photos=0 if options.most_lost is None else len(every),
-            dense_psnr=known,
+            gaussians=len(candidate.scene),
+            photos=0 if options.most_lost is None else len(photo_indices),
+            dense_psnr=dense_psnr,
         )
-        return psnr, replace(made, target=target)
+        return psnr, replace(candidate, target=target)
 
     if options.target_db is not None:
         best, found = smallest_within(len(dense), measure, options.target_db, stoppable=True)
-    else:  # trained on photos, a tenth loses about 0.8 dB, and 30 % no PSNR on average
-        least = known - (options.most_lost or 0.0)
+    else:  # trained on photos, a tenth loses about 0.8 dB on average, and 30 % loses none
+        least = dense_psnr - (options.most_lost or 0.0)
         best, found = smallest_within(
             len(dense), measure, least, stoppable=True, first=0.15, slope=0.8
         )

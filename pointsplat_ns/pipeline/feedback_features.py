@@ -1,4 +1,4 @@
-"""Features of each Gaussian for the feedback network: its gradients so far, Adam's steps, and its
+"""Features of each Gaussian for the feedback network: gradients so far, Adam's steps,
 parameters."""
 
 from __future__ import annotations
@@ -18,25 +18,23 @@ from pointsplat_ns.system.threads import one_thread_each, parallel_for
 
 @dataclass(frozen=True)
 class RepairSettings:
-    """Settings of repairs. Rates, decays and damping are tuned for the shipped network."""
+    """Settings of the repair. Rates, decays and damping are tuned for the shipped network."""
 
     adam: AdamSettings = AdamSettings(faster=8.0, betas=(0.8, 0.98), damping=0.5)
     """The learning rates and decays of 3DGS suit 30,000 steps; repairs are shorter. Without
-    damping, Adam moves all Gaussians equally far, also correct ones with tiny gradients. Half the
+    damping, Adam moves all Gaussians equally far, even correct ones with tiny gradients. Half the
     rates without damping gain as much where a scene has errors, but disturb correct parts."""
     fewest_steps: int = 6
-    """Least number of steps in the network's training; smaller numbers enter its features as this
-    one."""
+    """Minimum number of steps in the network's training; features clamp smaller numbers to it."""
     most_steps: int = 32
-    """Largest number of steps in the network's training; larger numbers enter its features as this
-    one."""
+    """Maximum number of steps in the network's training; features clamp larger numbers to it."""
     nearly_right: float = 35.0
-    """PSNR over the pixels that the dense scene covers, in dB, above which the learning rates fall
-    with the root mean square error, see
-    :func:`~pointsplat_ns.pipeline.repair.initial_rate_factor`. Full steps disturb a nearly
-    correct scene. Gains in dB with reduced and with full rates: half of a kettle at 44 dB 1.7 and
-    0.2, half of a cake at 42 dB 2.0 and 0.3, half of a room at 40 dB 1.2 and 0. Up to 36 dB, full
-    rates gain most. Tuned on a bouquet, a cake, a kettle, a statue and two rooms."""
+    """PSNR over the pixels that the dense scene covers, dB, above which learning rates fall with
+    the root mean square error; see :func:`~pointsplat_ns.pipeline.repair.initial_rate_factor`. Full
+    steps disturb a nearly correct scene. Gains in dB with reduced and with full rates: half of a
+    kettle at 44 dB 1.7 and 0.2, half of a cake at 42 dB 2.0 and 0.3, half of a room at 40 dB 1.2
+    and 0. Up to 36 dB, full rates gain most. Tuned on a bouquet, a cake, a kettle, a statue and two
+    rooms."""
     last_factor: float = 0.02
     """Factor on the learning rates at the last step, see
     :func:`~pointsplat_ns.pipeline.repair.rate_factor`."""
@@ -46,11 +44,10 @@ REPAIR = RepairSettings()
 
 
 class Feedback(Adam):
-    """Adam, with the features of each Gaussian from which a network chooses the length of its
-    steps.
+    """Adam with features of each Gaussian, from which a network chooses step lengths.
 
     Args:
-        scene: K Gaussians, at the start.
+        scene: K Gaussians before the first step.
         dense_count: number of Gaussians of the dense scene, N.
         settings: decays and damping.
     """
@@ -64,14 +61,14 @@ class Feedback(Adam):
 
     @torch.no_grad()
     def observe(self, gradients: dict[str, Tensor]) -> None:
-        """Take in the gradients of the loss in one view, all finite, by parameter."""
+        """Update the averages with the gradients of one view's loss, by parameter; all finite."""
         super().observe(gradients)
         self._gradients = gradients
         visible = (gradients["features_dc"] != 0).any(1, keepdim=True)
         self._visibility.lerp_(visible.to(self._visibility), 1 - self._settings.betas[1])
 
     def stepped(self, scene: Gaussians, gradients: dict[str, Tensor], choose: Choose) -> Gaussians:
-        """As :meth:`Adam.stepped`; the factors may be chosen of these gradients."""
+        """As :meth:`Adam.stepped`; the choice of factors may use these gradients."""
         self.observe(gradients)
         return self.moved(scene, *choose(scene))
 
@@ -83,23 +80,23 @@ class Feedback(Adam):
     def factors(
         self, network: Callable[[Tensor], Tensor], scene: Gaussians, done: float, steps: int
     ) -> Tensor:
-        """Factors (K, 6) of the steps that a network makes of :meth:`features`, which has the other
-        arguments. It gets pieces that stay in a core's cache, each on one thread: the result is the
-        same on any number of threads."""
-        found = scene.means.new_empty(len(scene), len(PARAMETERS))
+        """Step factors (K, 6) that a network computes from :meth:`features`, which documents the
+        other arguments. The network runs on pieces that fit a core's cache, one thread per piece,
+        so the result does not depend on the number of threads."""
+        factors = scene.means.new_empty(len(scene), len(PARAMETERS))
 
         def fill(rows: slice) -> None:
-            found[rows] = network(self.features(scene, done, steps, rows)).to(found)
+            factors[rows] = network(self.features(scene, done, steps, rows)).to(factors)
 
         with one_thread_each():
             parallel_for(fill, pieces(len(scene), scene.device, 1 << 12), scene.device)
-        return found
+        return factors
 
     @torch.no_grad()
     def features(
         self, scene: Gaussians, done: float, steps: int, rows: slice = slice(None)
     ) -> Tensor:
-        """Features of each Gaussian, of order 1.
+        """Features of each Gaussian, scaled to order 1.
 
         - for each parameter, over its components: logarithm of the root mean square gradient in
           units of the damping; norm of the mean gradient over it; logarithm of the last gradient
@@ -107,14 +104,14 @@ class Feedback(Adam):
         - Adam's steps for scales, opacity and colour
         - opacity, size relative to the median Gaussian, shape, colour, share of views in which it
           is visible
-        - the same for all Gaussians: share of the steps done, logarithms of the number of steps and
-          of the share kept
+        - common to all Gaussians: share of the steps done, logarithms of the number of steps and of
+          the share of Gaussians that remain
 
         Args:
-            scene: K Gaussians before the step.
+            scene: K Gaussians before this step.
             done: share of the steps done, in [0, 1].
-            steps: number of all steps.
-            rows: the Gaussians to compute them for; all by default.
+            steps: total number of steps.
+            rows: Gaussians to compute features for; by default all.
 
         Returns:
             (K, 39) float32, finite.
@@ -123,18 +120,14 @@ class Feedback(Adam):
             values[rows] for values in (scene.scales, scene.opacities, scene.features_dc)
         )
         columns: list[Tensor] = []
-        least = 1e-3  # share of the damping that is added to denominators
+        least = 1e-3  # share of the damping in denominators
         for name in PARAMETERS:
             if self._first[name].numel() == 0:
                 columns.append(scales.new_zeros(len(scales), 3))
                 continue
             unit = self._epsilon(name)
-            size = (
-                (self._second[name][rows] / self._weight_sum(1))
-                .flatten(1)
-                .mean(1, keepdim=True)
-                .sqrt()
-            )
+            squares = (self._second[name][rows] / self._weight_sum(1)).flatten(1)
+            size = squares.mean(1, keepdim=True).sqrt()
             mean = _rms(self._first[name][rows] / self._weight_sum(0))
             last = _rms(self._gradients[name][rows])
             columns += [
@@ -158,8 +151,8 @@ class Feedback(Adam):
             self._visibility[rows] / self._weight_sum(1),
         ]
         log_steps = math.log10(min(max(steps, REPAIR.fewest_steps), REPAIR.most_steps))
-        same = scene.means.new_tensor([done, log_steps, self._log_keep]).expand(len(scales), 3)
-        return torch.cat([*columns, same], dim=1).float().clamp_(-8, 8).nan_to_num_(0.0)
+        common = scene.means.new_tensor([done, log_steps, self._log_keep]).expand(len(scales), 3)
+        return torch.cat([*columns, common], dim=1).float().clamp_(-8, 8).nan_to_num_(0.0)
 
 
 def _rms(values: Tensor) -> Tensor:

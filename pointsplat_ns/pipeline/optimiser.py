@@ -1,8 +1,8 @@
-"""Optimises the parameters of a scene by Adam, so that its renders match target images.
+"""Optimises a scene with Adam, so that its renders match target images.
 
-The loss of a view is 0.8 RMSE + 0.2 (1 - SSIM). With L1 in place of the root mean squared error, as
-3DGS has it, a tenth that is trained on photos has 0.16 dB less in held-out photos, at equal LPIPS
-(fox, figure, ray, drone_hall), and a repair has 0.09 dB less (three splats at 3 to 50 %).
+The loss of a view is 0.8 RMSE + 0.2 (1 - SSIM). L1 in place of the root mean square error, as in
+3DGS, loses 0.16 dB in held-out photos at equal LPIPS for a tenth trained on photos (fox, figure,
+ray, drone_hall), and 0.09 dB for a repair (three splats at 3 to 50 %).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from pointsplat_ns.system.threads import most_threads, one_thread, one_thread_ea
 
 
 class AdamStepStruct(Struct):
-    """``AdamStep`` of ``optimiser.cpp``, which says what its members are."""
+    """``AdamStep`` of ``optimiser.cpp``, which documents its members."""
 
     members = {
         "values": FLOAT_POINTER,
@@ -77,12 +77,12 @@ RATES = {
 
 
 Choose = Callable[[Gaussians], tuple[float, Tensor | None]]
-"""From the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`."""
+"""Returns ``share`` and ``factors`` of :meth:`Adam.moves` for the scene before a step."""
 
-TOGETHER = 2
-"""Views whose gradients are computed at once, on a thread each, of one scene; then a step follows
-for each. Held-out photos lose nothing by two (fox, vr_project), and a repair 0.01 to 0.05 dB (three
-splats at 3 to 50 %). With four, a repair loses up to 0.16 dB."""
+VIEWS_AT_ONCE = 2
+"""Number of views whose gradients are computed in parallel from one scene; a step per view follows.
+Two views cost nothing in held-out photos (fox, vr_project), and 0.01 to 0.05 dB in a repair (three
+splats at 3 to 50 %). Four cost a repair up to 0.16 dB."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +94,18 @@ class AdamSettings:
     betas: tuple[float, float] = (0.9, 0.999)
     """Decays of the averages of the gradient and of its square."""
     damping: float = 0.0
-    """Adam's epsilon for each parameter, as a share of the root mean square of its nonzero
-    gradients in the first step that has any. 0 leaves an epsilon of 1e-15."""
+    """Adam's epsilon of each parameter, as a share of the root mean square of its first nonzero
+    gradients. 0 means an epsilon of 1e-15."""
 
 
 class Adam:
-    """Adam for the parameters of a scene: averages of gradients, and the steps from them.
+    """Adam for the parameters of a scene: averages of gradients, and the resulting steps.
 
     Args:
-        scene: K Gaussians, at the start.
+        scene: K Gaussians before the first step.
         settings: decays and damping.
-        rates: learning rates by parameter name; that of the means is multiplied by the extent of
-            the scene.
+        rates: learning rates by parameter name; the rate of the means is multiplied by the extent
+            of the scene.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Adam:
 
     @torch.no_grad()
     def observe(self, gradients: dict[str, Tensor]) -> None:
-        """Update the averages by the gradients of one view's loss, by parameter; all finite."""
+        """Update the averages with the gradients of one view's loss, by parameter; all finite."""
         self._steps += 1
         beta, square_beta = self._settings.betas
         for name in RATES:
@@ -144,7 +144,7 @@ class Adam:
 
         Args:
             share: factor on all learning rates.
-            factors: (K, 6), a factor for each Gaussian and parameter; None is 1.
+            factors: (K, 6), a factor per Gaussian and parameter; None means 1.
         """
         moves = {}
         for kind, name in enumerate(RATES):
@@ -157,14 +157,14 @@ class Adam:
     def moved(
         self, scene: Gaussians, share: float = 1.0, factors: Tensor | None = None
     ) -> Gaussians:
-        """A scene after a step; arguments as for :meth:`moves`."""
+        """The scene after a step; arguments as for :meth:`moves`."""
         moves = self.moves(share, factors)
         return scene.replace(**{name: value + moves[name] for name, value in scene.items()})
 
     @torch.no_grad()
     def stepped(self, scene: Gaussians, gradients: dict[str, Tensor], choose: Choose) -> Gaussians:
-        """A scene after a step: :meth:`observe`, then :meth:`moved` with the arguments that are
-        chosen of the scene; in one pass, by a compiled kernel, where it was built."""
+        """The scene after :meth:`observe` and :meth:`moved` with the result of ``choose``; in one
+        pass where the compiled kernel is available."""
         share, factors = choose(scene)
         if not KERNELS.usable_for(None, *scene.tensors()):
             self.observe(gradients)
@@ -198,7 +198,7 @@ class Adam:
         return scene.replace(**moved)
 
     def state(self) -> dict[str, Tensor]:
-        """What the next steps depend on, by name: the averages themselves, and the damping."""
+        """State of the optimiser by name: the averages (not copies) and the damping."""
         averages = {"first": self._first, "second": self._second}
         state = {
             f"{which}.{name}": value
@@ -208,27 +208,26 @@ class Adam:
         return {**state, "damping": torch.tensor([*self._damping.values()], **DOUBLES)}
 
     def restore(self, state: Mapping[str, Tensor], steps: int) -> None:
-        """Take over the state after some steps, from tensors of the shapes of :meth:`state`."""
+        """Restore the state after ``steps`` steps, from tensors with the shapes of
+        :meth:`state`."""
         self._steps = steps
         self._damping = dict(zip(RATES, state["damping"].tolist(), strict=True))
         for name, value in self.state().items():
             value.copy_(state[name])
 
     def root_mean_square(self, name: str) -> Tensor:
-        """Root of the mean square of the gradients by a parameter so far, (K,): over steps, summed
+        """Root mean square of a parameter's gradients so far, (K,): averaged over steps, summed
         over components."""
         return (self._second[name] / self._weight_sum(1)).flatten(1).sum(1).sqrt()
 
     def _weight_sum(self, which: int) -> float:
-        """The sum of the weights in an average, for bias correction; ``which`` indexes
-        ``betas``."""
+        """Sum of the weights in an average, for bias correction; ``which`` indexes ``betas``."""
         return 1 - self._settings.betas[which] ** self._steps
 
     def _damp(self, name: str, gradient: Tensor) -> None:
         if self._settings.damping:
-            self._damping[name] = self._damping[name] or self._settings.damping * nonzero_rms(
-                gradient
-            )
+            damping = self._settings.damping
+            self._damping[name] = self._damping[name] or damping * nonzero_rms(gradient)
 
     def _epsilon(self, name: str) -> float:
         return max(self._damping[name], 1e-15)
@@ -240,18 +239,18 @@ def optimised(
     examples: Iterator[Callable[[], Example]],
     choose: Choose = lambda scene: (1.0, None),
     pixel_loss: PixelLoss = "rmse",
-    together: int = TOGETHER,
+    together: int = VIEWS_AT_ONCE,
 ) -> Iterator[Gaussians]:
-    """Yield the scene after each step, without end. Values that are not finite (the logit of
-    opacity 1, the log-scale of a flat axis) do not change.
+    """Yield the scene after each step, endlessly. Values that are not finite (the logit of opacity
+    1, the log-scale of a flat axis) do not change.
 
     Args:
         scene: K Gaussians; not changed.
-        adam: its averages; made from the same scene.
-        examples: functions that make a view and its target image, on any thread; without end.
-        choose: the length of a step; called after its gradients are computed.
+        adam: optimiser, made from the same scene.
+        examples: endless functions that make a view and its target image, on any thread.
+        choose: sets the length of a step; called after its gradients are computed.
         pixel_loss: "l1" for the loss of 3DGS.
-        together: number of steps whose gradients are those of the scene before the first of them.
+        together: number of steps that share the scene from which gradients are computed.
     """
     last = scene.detach()
 
@@ -261,17 +260,16 @@ def optimised(
     while True:
         with one_thread_each():
             inside = max(1, most_threads() // together)
-            found = [*parallel_map(gradients, [*islice(examples, together)], scene.device, inside)]
-        for each in found:
+            batch = [*parallel_map(gradients, [*islice(examples, together)], scene.device, inside)]
+        for view_gradients in batch:
             with one_thread_each():
-                last = adam.stepped(last, each, choose)
+                last = adam.stepped(last, view_gradients, choose)
             yield last
 
 
 def extent(scene: Gaussians) -> float:
-    """The 90 % quantile of the distances from the median position along each axis, scene units; 1
-    if all Gaussians are in one place. One distant Gaussian does not change it, as it would change a
-    mean."""
+    """The 90 % quantile of distances from the per-axis median position, scene units; 1 if all
+    Gaussians are in one place. Unlike a mean, it is not changed by one distant Gaussian."""
     means = scene.means.detach().double()
     with one_thread():
         return float((means - means.median(0).values).norm(dim=1).quantile(0.9)) or 1.0
@@ -279,23 +277,23 @@ def extent(scene: Gaussians) -> float:
 
 @torch.no_grad()
 def size_factors(scene: Gaussians, reach: float) -> Tensor:
-    """Factors for :meth:`Adam.moves` that make the rate of the means a share of a Gaussian's own
-    size: of its middle standard deviation. The other rates stay.
+    """Factors for :meth:`Adam.moves` that make the rate of the means a share of each Gaussian's
+    middle standard deviation. Other rates stay.
 
     Args:
         scene: K Gaussians.
-        reach: extent of the scene when ``Adam`` was made, scene units; a larger size counts as
-            this.
+        reach: extent of the scene when ``Adam`` was made, scene units; larger sizes are clamped to
+            it.
 
     Returns:
         (K, 6).
     """
     factors = scene.means.new_ones(len(scene), len(RATES))
     a, b, c = scene.scales.unbind(1)
-    middle = torch.maximum(torch.minimum(a, b), torch.minimum(torch.maximum(a, b), c)).clamp(
-        max=math.log(reach)
-    )
-    factors[:, list(RATES).index("means")] = (middle - math.log(reach)).exp().nan_to_num(0.0)
+    log_reach = math.log(reach)
+    middle = torch.maximum(torch.minimum(a, b), torch.minimum(torch.maximum(a, b), c))
+    sizes = (middle.clamp(max=log_reach) - log_reach).exp()
+    factors[:, list(RATES).index("means")] = sizes.nan_to_num(0.0)
     return factors
 
 
@@ -307,14 +305,14 @@ def gradients_of(
     backend: Literal["torch", "auto"] = "torch",
     pixel_loss: PixelLoss = "rmse",
 ) -> dict[str, Tensor]:
-    """Gradients of the loss of one view by parameter. A gradient is 0 where it or the value itself
-    is not finite.
+    """Gradients of one view's loss, by parameter. A gradient is 0 where it or its value is not
+    finite.
 
     Args:
         scene: K Gaussians.
         view: the camera.
         target: (H, W, 3) target image in [0, 1].
-        mask: (H, W, 1) bool, the pixels that count; None for all.
+        mask: (H, W, 1) bool, pixels of the loss; None for all.
         backend: the rasterizer, as for :func:`pointsplat_ns.rendering.render`.
         pixel_loss: as for :func:`optimised`.
     """
@@ -326,8 +324,8 @@ def gradients_of(
         name: torch.zeros_like(value) if value.grad is None else value.grad
         for name, value in leaves.items()
     }
-    # Sums are finite where all numbers are, nearly always, and take a tenth of the time of looking
-    # at each.
+    # Nearly always, all values are finite, and so are their sums. A sum takes a tenth of the time
+    # of an elementwise check.
     sums = torch.stack([value.detach().sum() for value in (*leaves.tensors(), *gradients.values())])
     if not bool(sums.isfinite().all()):
         for name, value in leaves.items():
@@ -336,7 +334,7 @@ def gradients_of(
 
 
 def nonzero_rms(gradient: Tensor) -> float:
-    """Root mean square of the gradients that are not 0, in float64; 0 if all are."""
+    """Root mean square of the nonzero gradients, in float64; 0 if there are none."""
     nonzero = gradient[gradient != 0].double()
     with one_thread():
         return float(nonzero.square().mean().sqrt()) if nonzero.numel() else 0.0

@@ -1,8 +1,9 @@
-"""Options of a request, for the command line and the Python API alike.
+"""Options of a request, shared by the command line and the Python API.
 
-``tyro`` turns each field into an option of a command; the docstring below a field is its help.
-Options hold what the user wrote. Derived values are parsed once: :meth:`ReductionOptions.check`,
-called before a scene is read, raises what is wrong with them. This module imports torch only then.
+``tyro`` turns every field into an option of a command; the docstring below a field is its help.
+Fields keep the user's text. Derived values are parsed once: :meth:`ReductionOptions.check` runs
+before a scene is read and raises an error for an invalid option. Only then does this module import
+torch.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ if TYPE_CHECKING:
     from pointsplat_ns.view_sampling.upright import Up
 
 NO_POSES = "none"
-"""In place of a file of cameras: views are sampled, whatever lies beside the scene."""
+"""Value of ``poses`` that always samples views, even with a camera file beside the scene."""
 
-KEPT_AUTO = 0.3
-"""Largest loss of PSNR in held-out photos of ``--photos --keep auto``, dB."""
+AUTO_PHOTO_LOSS = 0.3
+"""Maximum loss of PSNR in held-out photos with ``--photos --keep auto``, dB."""
 
 Bands = Literal["all", "auto", "0", "1", "2", "3"]
 
@@ -43,8 +44,8 @@ def default_device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _as_written(metavar: str) -> PrimitiveConstructorSpec:
-    """How tyro reads an option that the package parses itself: as the text that was written."""
+def _verbatim(metavar: str) -> PrimitiveConstructorSpec:
+    """Spec for tyro that passes an option on as text, which the package parses itself."""
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=metavar,
@@ -55,8 +56,8 @@ def _as_written(metavar: str) -> PrimitiveConstructorSpec:
 
 
 def parse_path(text: str) -> Path:
-    """The path that was written. Raises ValueError if it is empty, which would be the current
-    folder: that of a script whose variable is not set."""
+    """Path from text. Raises ValueError if it is empty: ``Path("")`` is the current folder, and an
+    unset variable in a script gives an empty argument."""
     if not text:
         raise ValueError("an empty path; expected a name, or . for the current folder")
     return Path(text)
@@ -64,11 +65,11 @@ def parse_path(text: str) -> Path:
 
 def _photos(words: list[str]) -> Path | bool:
     if len(words) > 1 or words == [""]:
-        raise ValueError("expected a folder of photos, or nothing for those of a run")
+        raise ValueError("expected a folder of photos, or no value for the photos of a run")
     return Path(words[0]) if words else True
 
 
-Budget = Annotated[Any, _as_written("BUDGET")]
+Budget = Annotated[Any, _verbatim("BUDGET")]
 """A ratio, count, size or PSNR, as text or parsed (:data:`~pointsplat_ns.pruning.Keep`)."""
 
 Poses = Annotated[
@@ -81,9 +82,9 @@ Poses = Annotated[
         str_from_instance=lambda value: [str(value)],
     ),
 ]
-"""A file of cameras, a run, or :data:`NO_POSES`."""
+"""A camera file, a run, or :data:`NO_POSES`."""
 
-Resolution = Annotated[tuple[int, int] | str | None, _as_written("WxH")]
+Resolution = Annotated[tuple[int, int] | str | None, _verbatim("WxH")]
 
 Photos = Annotated[
     Path | str | bool,
@@ -95,26 +96,26 @@ Photos = Annotated[
         str_from_instance=lambda value: ["none"] if value is False else [str(value)],
     ),
 ]
-"""Whether to use the photos of a run, or the folder of other photos."""
+"""Whether to use the photos of the run, or a folder of photos."""
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Where renders look from, and how large they are."""
+    """Cameras and size of renders."""
 
     poses: Poses = None
-    """A file of cameras of the scene: cameras.json of 3DGS, transforms.json of nerfstudio, or the
-    folder of a COLMAP project. By default the views of its dataset, or of such a file beside the
-    scene or above it, or sampled ones; none always samples them."""
+    """Camera file of the scene: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder
+    of a COLMAP project. By default the views of the scene's dataset, else of a camera file beside
+    the scene or above it, else sampled views; none always samples views."""
     resolution: Resolution = None
-    """Size of the pictures that people look at, pixels. Decisions by rendering are made at this
-    size. By default the size of the photos, if there are any, else 1920x1080."""
+    """Size at which people view the scene, pixels. Decisions by rendering use this size. By default
+    the size of the photos, if there are any, else 1920x1080."""
     up: Annotated[str | None, arg(metavar="AXIS")] = None
-    """The axis that is up in the scene: x, y, z, -x, -y or -z, for sampled views; by default the
-    file's own, or an estimate. Write --up=-y for a negative axis."""
+    """Up axis of the scene for sampled views: x, y, z, -x, -y or -z; by default declared by the
+    file, or estimated. Write --up=-y for a negative axis."""
     data: Path | str | None = None
-    """Folder of the run's photos and poses, or one above it, if it is no longer where the run says.
-    In a folder of scenes, a run whose data is not found gets sampled views, which its note says."""
+    """Folder of the run's photos and poses, or a folder above it, if the data has moved since
+    training. In a folder of scenes, a run without data gets sampled views and a note."""
 
     @cached_property
     def size(self) -> tuple[int, int] | None:
@@ -136,17 +137,17 @@ class ViewOptions:
 
     @property
     def sampled(self) -> bool:
-        """Whether views are sampled, whatever lies beside the scene."""
+        """Whether views are always sampled, even with a camera file beside the scene."""
         return self.poses is not None and str(self.poses) == NO_POSES
 
     def check(self) -> None:
-        """Raise a PointSplatError if an option is not valid."""
+        """Raise a PointSplatError if an option is invalid."""
         _ = self.size, self.upward
 
 
 @dataclass(frozen=True)
 class ReductionOptions:
-    """How many Gaussians are kept, and which.
+    """Size of the result, and the method that selects its Gaussians.
 
     Example:
         >>> ReductionOptions("30%", sh="1").count_of(1000, sh_degree=1)
@@ -154,53 +155,55 @@ class ReductionOptions:
     """
 
     keep: Budget = "0.3"
-    """Size of the result: a ratio (0.3), a percentage (30%), a count (50000 or 50k), the size of
-    the file (12MB or 800kB; for .spz and .sog the count is searched for, which takes two or three
-    times as long), or auto:35, the smallest scene whose renders reach 35 dB PSNR against those of
-    the dense scene (auto alone means 35)."""
+    """Size of the result: a ratio (0.3), a percentage (30%), a count (50000 or 50k), a file size
+    (12MB or 800kB; .spz and .sog need a search, which takes two or three times as long), or
+    auto:35, the smallest scene whose renders reach 35 dB PSNR against the dense scene (auto alone
+    means 35)."""
     by: str = "merge"
-    """The method. merge replaces neighbours by one Gaussian each and is usually best; every other
-    method keeps Gaussians as they are: coverage (empties no region), paper (eq. 3), authors (the
-    formula of its released code), opacity, random; lightgaussian and pup score by views of the
-    scene."""
+    """Pruning method. merge replaces groups of neighbours by one Gaussian and is usually best. The
+    other methods select Gaussians without changing them: coverage (empties no region), paper (eq.
+    3), authors (the formula of the paper's released code), opacity, random; lightgaussian and pup
+    score Gaussians in views of the scene."""
     opacity_weight: Annotated[float | None, arg(aliases=("--lambda",))] = None
-    """Lambda of paper and authors, in [0, 1]: the weight of opacity against volume; by default the
-    paper's 0.3."""
+    """Lambda of paper and authors, in [0, 1]: weight of opacity against volume; by default 0.3, as
+    in the paper."""
     sh: Bands = "all"
-    """SH bands to keep: all, up to a degree, or auto, the lowest degree whose renders reach 40
+    """SH bands to keep: all, a maximum degree, or auto, the lowest degree whose renders reach 40
     dB."""
     clean: bool = False
-    """First remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read."""
+    """First remove Gaussians that cannot be drawn or seen; --keep still refers to the whole
+    scene."""
     target_format: Suppress[str] = ".ply"
-    """Suffix of the format of the result, which a size or a PSNR in ``keep`` is for if it names
-    none."""
+    """Suffix of the format of the result. A size or PSNR in ``keep`` without a format refers to
+    it."""
 
     @cached_property
     def budget(self) -> Keep:
         """``keep``, parsed. Raises BudgetError if it is not a budget."""
         from pointsplat_ns.pruning import parse_keep
 
-        return (
-            parse_keep(self.keep, self.target_format) if isinstance(self.keep, str) else self.keep
-        )
+        if isinstance(self.keep, str):
+            return parse_keep(self.keep, self.target_format)
+        return self.keep
 
     @cached_property
     def method(self) -> Method:
-        """The method ``by``. Raises PointSplatError if it is unknown, or has no opacity weight."""
+        """The method ``by``. Raises PointSplatError if it is unknown, or takes no opacity
+        weight."""
         from pointsplat_ns.pruning import method_named
 
         return method_named(self.by, self.opacity_weight)
 
     def check(self) -> None:
-        """Raise a PointSplatError if an option is not valid, or does not fit another."""
+        """Raise a PointSplatError if an option is invalid, or contradicts another."""
         _ = self.method, self.budget
         if self.sh not in ("all", "auto", "0", "1", "2", "3"):
             raise PointSplatError(f"sh is {self.sh!r}; expected all, auto or a degree from 0 to 3")
 
     def count_of(self, n: int, sh_degree: int, traits: Traits | None = None) -> int | None:
-        """Number of Gaussians to keep of ``n``, which depends on the SH degree and traits of the
-        result where it has to fit a file; None if it needs a search (a PSNR, or the size of a
-        compressed file). Raises BudgetError if the budget does not fit the scene."""
+        """Number of Gaussians to keep of ``n``; None if the budget needs a search (a PSNR, or the
+        size of a compressed file). SH degree and traits of the result matter for a file size.
+        Raises BudgetError if the budget does not fit the scene."""
         from pointsplat_ns.pruning import found_by_trying, resolve_keep
         from pointsplat_ns.scene.gaussians import PLAIN
 
@@ -214,9 +217,9 @@ class PruneOptions(ViewOptions, ReductionOptions):
     """Options of :func:`pointsplat_ns.prune`."""
 
     photos: Photos = False
-    """Also print PSNR in held-out photos: of the dataset of a run, or every eighth photo, by name,
-    in FOLDER. Nothing is trained. Its poses, those of --poses or of a file of cameras there, above
-    it or beside the scene, are then the views."""
+    """Also print PSNR in held-out photos: the run's test split, or every eighth photo in FOLDER, by
+    name. Nothing is trained. Poses for FOLDER come from --poses, or from a camera file in it, above
+    it or beside the scene; they are then the views."""
 
     def check(self) -> None:
         ViewOptions.check(self)
@@ -225,38 +228,36 @@ class PruneOptions(ViewOptions, ReductionOptions):
 
 @dataclass(frozen=True)
 class CompactOptions(PruneOptions):
-    """Options of :func:`pointsplat_ns.compact`: a scene is pruned, refined if there is a refiner,
-    and repaired.
+    """Options of :func:`pointsplat_ns.compact`, which prunes, refines and repairs a scene.
 
     ``keep`` may be None, and ``by`` empty, until :meth:`completed`.
     """
 
     keep: Budget = None
-    """Size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before
-    repairs. With --photos, auto is the smallest file that loses at most 0.3 dB in held-out photos.
-    By default the budget of the refiner's training; without a refiner 0.1."""
+    """Size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which pruning alone
+    reaches. With --photos, auto is the smallest file that loses at most 0.3 dB in held-out photos.
+    By default 0.1; with a refiner the budget of its training."""
     by: str = ""
-    """The method of prune; by default the method of the refiner's training; without a refiner
-    merge."""
+    """Pruning method, as for prune; by default merge; with a refiner the method of its training."""
     refiner: Path | str | None = None
-    """A trained network that refines the scene before the steps: a pointsplat run (its folder or
+    """Trained network that refines the scene before the repair: a pointsplat run (its folder or
     config.yml), a .safetensors file, or shipped; by default none."""
     effort: Effort = "quick"
-    """Length of the repair: no steps (instant), 192 (quick), or 1200 (thorough); up to four times
+    """Length of the repair in steps: 0 (instant), 192 (quick) or 1200 (thorough); up to four times
     as many for more than 20,000 Gaussians."""
     seconds: float | None = None
-    """Duration of the repair, in place of --effort; by default none is set. Ctrl-C ends it earlier
+    """Duration of the repair, in place of --effort; by default unset. Ctrl-C ends the repair early
     and writes the scene so far."""
     photos: Photos = False
-    """In place of the repair train on photos, by 2400 steps (quick) or 12000 (thorough), or for
-    --seconds. Photos in and outside of the steps say whether it helped. For a run, those of its
-    dataset; for any scene, those in FOLDER, with the poses of --poses, or of a file of cameras
-    there, above it or beside the scene."""
+    """Train on photos in place of the repair: 2400 steps (quick), 12000 (thorough), or --seconds.
+    The result is accepted by its PSNR in training photos and in photos set aside. A run has photos
+    in its dataset. Any scene takes photos from FOLDER, with poses from --poses, or from a camera
+    file in FOLDER, above it or beside the scene."""
     target_db: float | None = None
-    """In place of --keep, the smallest file that has at least this PSNR against renders of the
-    dense scene, after all repairs; by default none is searched for."""
+    """Minimum PSNR of the final file against renders of the dense scene, dB, in place of --keep:
+    finds the smallest such file; by default unset."""
     most_lost: Suppress[float | None] = None
-    """Largest loss of PSNR of the file in held-out photos, dB, in place of the budget; set by
+    """Maximum loss of PSNR in held-out photos, dB, in place of the budget; set by
     :meth:`completed`."""
 
     @property
@@ -266,19 +267,20 @@ class CompactOptions(PruneOptions):
 
     @cached_property
     def repair(self) -> RepairBudget:
-        """Length of the repair. ``seconds`` are for the training on photos, where there is one."""
+        """Length of the repair. ``seconds`` apply to training on photos instead, if there is
+        any."""
         if self.on_photos and self.seconds is not None:
             return RepairBudget()
         return RepairBudget(self.effort, self.seconds)
 
     @cached_property
     def photo_budget(self) -> PhotoBudget | None:
-        """Length of the training on photos; None without one."""
+        """Length of training on photos; None without photos."""
         return PhotoBudget(self.effort, self.seconds) if self.on_photos else None
 
     @property
     def searched(self) -> bool:
-        """Whether the count is searched for that reaches a quality after all stages."""
+        """Whether the count is searched for, to reach a quality after all stages."""
         return self.target_db is not None or self.most_lost is not None
 
     def check(self) -> None:
@@ -287,17 +289,16 @@ class CompactOptions(PruneOptions):
                 f"--target-db is {self.target_db:g}; expected a positive number, such as 32"
             )
         if self.target_db is not None and (self.on_photos or self.keep is not None):
-            other = "photos, which may differ from renders" if self.on_photos else "a budget"
+            other = "--photos, which may differ from renders" if self.on_photos else "--keep"
             raise BudgetError(
-                "--target-db finds a size by renders of the dense scene; expected it without "
-                f"{other}"
+                f"--target-db finds a size by renders of the dense scene; expected no {other}"
             )
         _ = self.repair, self.photo_budget
         ViewOptions.check(self)
 
     def completed(self, refiner: TrainedRefiner | None = None) -> CompactOptions:
-        """The options, checked, with ``keep`` and ``by`` of the refiner's training where none is
-        named; without a refiner, a tenth and merging. Raises a PointSplatError as :meth:`check` and
+        """The checked options with default ``keep`` and ``by``: those of the refiner's training,
+        else a tenth by merging. Raises a PointSplatError as :meth:`check` and
         :meth:`ReductionOptions.check`."""
         from pointsplat_ns.pruning import PruneSettings, method_named
 
@@ -307,21 +308,21 @@ class CompactOptions(PruneOptions):
         weight = self.opacity_weight
         if weight is None and method_named(by).weighs_opacity:
             weight = usual.opacity_weight
-        most_lost = KEPT_AUTO if self.on_photos and self.keep == "auto" else self.most_lost
+        most_lost = AUTO_PHOTO_LOSS if self.on_photos and self.keep == "auto" else self.most_lost
         keep = usual.keep if self.keep is None or most_lost is not None else self.keep
         done = replace(self, keep=keep, by=by, opacity_weight=weight, most_lost=most_lost)
         ReductionOptions.check(done)
         return done
 
     def check_sh_degree(self, dense: Gaussians, refiner: TrainedRefiner | None) -> None:
-        """Raise a SceneError, before the long computations, if the SH degree after pruning is
-        certain to exceed the refiner's."""
+        """Raise a SceneError, before long computations, if the SH degree after pruning is certain
+        to exceed the refiner's."""
         if refiner is None:
             return
         limit = refiner.network.config.sh_degree
         certain = self.sh == "all" or (self.sh.isdigit() and int(self.sh) > limit)
         if dense.sh_degree > limit and certain:
             raise SceneError(
-                f"the scene has SH degree {dense.sh_degree}; the refiner {refiner.source} was "
-                f"built for at most {limit}; cut it with --sh {limit}"
+                f"the scene has SH degree {dense.sh_degree}, but the refiner {refiner.source} "
+                f"supports at most {limit}; cut the SH bands with --sh {limit}"
             )

@@ -1,17 +1,16 @@
-"""Optimises a smaller scene against the photos that the dense scene was trained on.
+"""Optimises a smaller scene against the training photos of the dense scene.
 
-A repair against renders of the dense scene cannot be better than these. Photos hold more. Each step
-takes every k-th pixel of a photo and a step of Adam on 0.8 RMSE + 0.2 (1 - SSIM). Few pixels allow
-many steps. Every eighth step takes a render of the dense scene from a sampled pose, which holds the
-parts that photos show little of.
+A repair against renders cannot beat the dense scene; photos can. Each step of Adam minimises 0.8
+RMSE + 0.2 (1 - SSIM) over every k-th pixel of a photo: few pixels allow many steps. Every eighth
+step takes a render of the dense scene from a sampled pose instead, to preserve parts that photos
+hardly show.
 
-Every eighth photo takes part in no step. The result is kept if PSNR rises in photos of the steps,
-and does not fall in these. Where it falls, the result is compared with a repair. The dense scene
-was trained on these photos, too, and knows them better than either does, so a small loss says
-little.
+Every eighth photo is set aside from the steps. The result is accepted if PSNR rises in the photos
+of the steps and does not fall in the photos set aside. If it falls there, the result is compared
+with a repair, with a tolerance: the dense scene was trained on the photos set aside too, so a small
+loss in them means little.
 
-A few times, Gaussians are split where the loss pulls at them most, and merging makes them as many
-as before.
+A few times, Gaussians with the largest gradients are split, and merging restores the count.
 """
 
 from __future__ import annotations
@@ -51,43 +50,44 @@ from pointsplat_ns.view_sampling.sampler import Sampler
 
 @dataclass(frozen=True)
 class PhotoSettings:
-    """Settings of the optimisation."""
+    """Settings of training on photos."""
 
     adam: AdamSettings = AdamSettings(faster=8.0, damping=0.01)
-    """The rates are those of the first step. Without damping, a Gaussian that photos show in a few
-    pixels moves as far as others, and becomes a fog before cameras that no photo has: a sampled
-    view has 13 dB against the dense scene in place of 26 (fox, 30 %). Held-out photos lose 0.2 dB
-    at a damping of 0.1, and nothing at 0.01 (fox, vr_project)."""
+    """Rates are those of the first step. Without damping, a Gaussian that covers a few pixels of
+    the photos moves as far as the others and becomes fog in front of other cameras: a sampled view
+    has 13 dB against the dense scene instead of 26 (fox, 30 %). Held-out photos lose 0.2 dB at a
+    damping of 0.1, and nothing at 0.01 (fox, vr_project)."""
     means_rate: float = 0.01
-    """Learning rate of the means, before that factor: a share of each Gaussian's own size. With
-    3DGS' rate, a share of the scene's extent, and half of the factor, a tenth ends 0.3 dB (fox) and
-    1.0 dB (vr_project) lower in held-out photos. A hundred times that share gains as much in one of
-    them and loses 2 dB in the other, whose background is far."""
+    """Learning rate of the means before ``adam.faster``, as a share of each Gaussian's own size.
+    With the rate of 3DGS, a share of the scene's extent, and half of ``faster``, a tenth ends 0.3
+    dB (fox) and 1.0 dB (vr_project) lower in held-out photos. A hundred times the rate of 3DGS
+    gains as much in one of them and loses 2 dB in the other, whose background is far."""
     last_factor: float = 0.05
-    """Factor on the first rates at the last step. They fall along a half cosine."""
+    """Factor on the rates at the last step. They fall along a half cosine."""
     side: int = 160
-    """Longer side of what a step draws of a photo or of a sampled view, pixels. Many steps on few
-    pixels gain most: in the time of 1,600 steps on 200 there are 2,400 on 140, and a tenth has 0.1
-    dB more in held-out photos and 0.5 dB more in sampled views (fox, vr_project). On 80, LPIPS is
+    """Longer side of the picture that a step draws, pixels. Many steps on few pixels gain most:
+    1,600 steps at 200 pixels take as long as 2,400 at 140, which gain 0.1 dB more in held-out
+    photos and 0.5 dB more in sampled views at a tenth (fox, vr_project). At 80 pixels, LPIPS is
     worse."""
     dense_every: int = 8
-    """One step of this many takes a render of the dense scene. With every sixteenth, held-out
-    photos gain 0.06 dB, and sampled views lose 1.1 dB against the dense scene (fox, ray,
-    drone_hall, vr_project at a tenth)."""
+    """Number of steps per render of the dense scene. With 16, held-out photos gain 0.06 dB and
+    sampled views lose 1.1 dB against the dense scene (fox, ray, drone_hall, vr_project at a
+    tenth)."""
     most_lost: float = 1.5
-    """Largest fall of PSNR below a repair, in photos of no step, with which a result is kept, dB.
-    Of 20 trainings at 30 and 50 % on 7 photos to all (ray, figure, drone_hall, fox) nine are kept,
-    which have 0.7 dB more in held-out photos than a repair, one of them 0.4 dB less; the others
-    have 0.6 dB less on average, and 0.4 dB more at most."""
+    """Maximum loss of PSNR against a repair, in photos set aside, dB. Of 20 trainings at 30 and 50
+    % on 7 photos to all (ray, figure, drone_hall, fox), nine are accepted. In held-out photos they
+    have 0.7 dB more than a repair on average (the worst 0.4 dB less); the rejected ones have 0.6 dB
+    less (the best 0.4 dB more)."""
     large: int = 40_000
-    """Number of Gaussians above which a scene is repaired before it is trained, and steps draw more
-    pixels: as a repair does for so many. 160 pixels show too little of it at once, and what one
-    step gains elsewhere is lost. In held-out photos, without and with both: 53,574 of a plant 23.3
-    and 23.5 dB, 84,307 of a garden, whose photos are renders, 22.4 and 22.9."""
+    """Number of Gaussians above which a scene is repaired before training, and steps draw more
+    pixels, as in a repair of that count. At 160 pixels, a step shows too little of a large scene,
+    and its gain is lost elsewhere. PSNR in held-out photos without and with both: 23.3 and 23.5 dB
+    (53,574 Gaussians of a plant), 22.4 and 22.9 dB (84,307 of a garden, whose photos are
+    renders)."""
     moves: int = 5
-    """Number of times that Gaussians are moved (:func:`reallocated`) to where the gradients
-    by their means, in units of their size, are largest. At a tenth, held-out photos gain 0.5 dB
-    (fox), 0.2 dB (vr_project) and nothing (kitchen, whose photos are blurred)."""
+    """Number of reallocations (:func:`reallocated`) to places with the largest gradients of the
+    means, in units of the Gaussians' size. At a tenth, held-out photos gain 0.5 dB (fox), 0.2 dB
+    (vr_project) and nothing (kitchen, whose photos are blurred)."""
 
 
 PHOTO_REPAIR = PhotoSettings()
@@ -95,59 +95,56 @@ PHOTO_REPAIR = PhotoSettings()
 
 @dataclass(frozen=True, eq=False)
 class PhotoRepaired:
-    """A scene that was optimised against photos."""
+    """A scene optimised against photos."""
 
     scene: Gaussians
     """The scene after the last step."""
     before: float
-    """Mean PSNR of another scene in the compared photos, dB: of that before the first step, or of a
-    repaired one."""
+    """Mean PSNR of the baseline in the compared photos, dB. The baseline is the scene before the
+    first step, or a repaired one."""
     after: float
     """The same of ``scene``, dB."""
-    unseen_before: float
-    """Mean PSNR of that scene in photos that take part in no step, dB."""
-    unseen: float
+    set_aside_before: float
+    """Mean PSNR of the baseline in photos set aside from the steps, dB."""
+    set_aside: float
     """The same of ``scene``, dB."""
     used: int
-    """Number of photos of the steps."""
+    """Number of photos in the steps."""
     compared: int
-    """Number of the compared photos."""
+    """Number of compared photos."""
     steps: int
     seconds: float
     interrupted: bool
     """Whether Ctrl-C ended it early."""
 
     def rejection(self, most_lost: float = 0.0) -> Reason | None:
-        """Why the scene does not replace the other, if photos of no step may lose that many dB;
-        None if it does."""
+        """Reason to reject the scene in favour of the baseline; None if it is accepted. Photos set
+        aside may lose ``most_lost`` dB."""
         if not self.after >= self.before + ACCEPTANCE.min_gain:  # NaN too
             return SMALL_GAIN
-        lost = self.unseen_before - self.unseen
+        lost = self.set_aside_before - self.set_aside
         return Reason(Cause.WORSE_IN_OTHER_PHOTOS, decibels=lost) if lost > most_lost else None
 
-    def beside(self, other: Gaussians, photos: Photos) -> PhotoRepaired:
-        """The same, compared with another scene in the same photos."""
-        before, unseen_before = _psnrs(other, photos)
-        return replace(self, before=before, unseen_before=unseen_before)
+    def against(self, other: Gaussians, photos: Photos) -> PhotoRepaired:
+        """The same scene with another baseline, compared in the same photos."""
+        before, set_aside_before = _psnrs(other, photos)
+        return replace(self, before=before, set_aside_before=set_aside_before)
 
 
 def _psnrs(scene: Gaussians, photos: Photos) -> tuple[float, float]:
-    """Mean PSNR in the compared photos, and in photos that take part in no step, dB."""
-    _, compared, unseen = _roles(len(photos))
-    return mean_psnr(scene, photos, compared), mean_psnr(scene, photos, unseen)
+    """Mean PSNR in the compared photos and in the photos set aside, dB."""
+    _, compared, set_aside = _photo_roles(len(photos))
+    return mean_psnr(scene, photos, compared), mean_psnr(scene, photos, set_aside)
 
 
-def _roles(count: int) -> tuple[list[int], list[int], list[int]]:
-    """Indices of the photos of the steps, of those of them that are compared, and of photos of no
-    step to compare."""
-    apart = list(range(0, count, 8))
-    used = sorted({*range(count)} - {*apart})
+def _photo_roles(count: int) -> tuple[list[int], list[int], list[int]]:
+    """Indices of the photos in the steps, the compared ones among them, and the compared ones of
+    the photos set aside."""
+    set_aside = list(range(0, count, 8))
+    used = sorted({*range(count)} - {*set_aside})
     compared = [used[place] for place in spread_indices(len(used), VIEW_COUNTS.compared)]
-    return (
-        used,
-        compared,
-        [apart[place] for place in spread_indices(len(apart), VIEW_COUNTS.compared // 2)],
-    )
+    places = spread_indices(len(set_aside), VIEW_COUNTS.compared // 2)
+    return used, compared, [set_aside[place] for place in places]
 
 
 def photo_repair(
@@ -158,15 +155,15 @@ def photo_repair(
     budget: PhotoBudget,
     progress: Callable[[float], None] | None = None,
 ) -> PhotoRepaired:
-    """Optimise a smaller scene against photos; its number of Gaussians does not change. Ctrl-C ends
-    it early.
+    """Optimise a smaller scene against photos. The number of Gaussians does not change. Ctrl-C ends
+    the steps early.
 
     Args:
         scene: K Gaussians; not changed.
         dense: N Gaussians on the same device.
         photos: training photos; at least two.
         views: source of views without photos.
-        budget: length; not empty.
+        budget: length of the training; not empty.
         progress: called with the share done, in [0, 1].
 
     Raises:
@@ -174,21 +171,21 @@ def photo_repair(
     """
     if len(photos) < 2:
         raise DataError(
-            f"{len(photos)} photos to train on; expected at least two, one of them to compare with"
+            f"{len(photos)} photos to train on; expected at least two, one of them for comparison"
         )
     run = OptimisationRun(budget)
-    used, compared, _ = _roles(len(photos))
-    before, unseen_before = _psnrs(scene, photos)
+    used, compared, _ = _photo_roles(len(photos))
+    before, set_aside_before = _psnrs(scene, photos)
     growth = budget.for_count(len(scene)).growth if len(scene) > PHOTO_REPAIR.large else 1.0
     examples = _examples(photos, used, dense, views, round(growth * PHOTO_REPAIR.side))
     last = run.take(scene, _scenes(scene, examples, views, run), progress)
-    after, unseen = _psnrs(last, photos)
+    after, set_aside = _psnrs(last, photos)
     return PhotoRepaired(
         scene=last,
         before=before,
         after=after,
-        unseen_before=unseen_before,
-        unseen=unseen,
+        set_aside_before=set_aside_before,
+        set_aside=set_aside,
         used=len(used),
         compared=len(compared),
         steps=run.count,
@@ -203,17 +200,16 @@ def _scenes(
     views: ViewProvider,
     run: OptimisationRun,
 ) -> Iterator[Gaussians]:
-    """The scene after each step of a run, without end."""
+    """The scene after each step of a run, endlessly."""
     rates = {**RATES, "means": PHOTO_REPAIR.means_rate}
     for turn in counted(1):
         adam = Adam(scene, PHOTO_REPAIR.adam, rates)
 
         def choose(scene: Gaussians, adam: Adam = adam) -> tuple[float, Tensor]:
-            return cosine_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(
-                scene, adam.reach
-            )
+            share = cosine_factor(run.done, PHOTO_REPAIR.last_factor)
+            return share, size_factors(scene, adam.reach)
 
-        # the last time when half of the steps are done
+        # The last reallocation comes when half of the steps are done.
         until = 0.5 * turn / PHOTO_REPAIR.moves if turn <= PHOTO_REPAIR.moves else math.inf
         for stepped in optimised(scene, adam, examples, choose):
             yield (scene := stepped)
@@ -226,8 +222,8 @@ def _scenes(
 def _examples(
     photos: Photos, used: list[int], dense: Gaussians, views: ViewProvider, side: int
 ) -> Iterator[Callable[[], Example]]:
-    """Photos, each once before any is repeated, and renders of the dense scene, each drawn once;
-    without end. Their longer side has about ``side`` pixels."""
+    """Photos, shuffled in every round, and renders of the dense scene, drawn once and reused;
+    endless. Their longer side has about ``side`` pixels."""
     generator = random.Random(0)
     sampled = islice(views.sampled(drawn_side=side), VIEW_COUNTS.stepped)
     renders = cycle(functools.cache(functools.partial(render_of, dense, view)) for view in sampled)
@@ -242,13 +238,13 @@ def _examples(
 
 @torch.no_grad()
 def reallocated(scene: Gaussians, pull: Tensor, share: float, views: Views | Sampler) -> Gaussians:
-    """Split Gaussians, and merge the scene to as many as there were.
+    """Split Gaussians, and merge the scene to its former count.
 
     Args:
         scene: K Gaussians; not changed.
-        pull: (K,), those with the largest are split.
-        share: of the Gaussians that are split, in [0, 1].
-        views: views that weigh errors of merging, as for :func:`pointsplat_ns.pruning.prune`.
+        pull: (K,) strength of the gradients; Gaussians with the largest are split.
+        share: share of the Gaussians to split, in [0, 1].
+        views: views for visibility weights, as for :func:`pointsplat_ns.pruning.prune`.
 
     Returns:
         K Gaussians; ``scene`` if fewer than K are finite.
@@ -261,22 +257,19 @@ def reallocated(scene: Gaussians, pull: Tensor, share: float, views: Views | Sam
 
 
 def split(scene: Gaussians, indices: Tensor) -> Gaussians:
-    """A scene (K) in which some Gaussians (n,) are replaced by two halves each, side by side along
-    their longest axis: (K + n), halves last. Both together have the second moments of the whole."""
-    others = torch.ones(len(scene), dtype=torch.bool, device=scene.device).index_fill(
-        0, indices, False
-    )
+    """Replace n of K Gaussians by two halves, side by side along the longest axis: (K + n), halves
+    last. The halves together keep the second moments of the whole."""
+    others = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
+    others[indices] = False
     whole = scene[indices]
     longest = whole.scales.argmax(dim=1, keepdim=True)  # [n, 1]
     axes = rotation_matrices(whole.quats).gather(2, longest[:, :, None].expand(-1, 3, 1))[:, :, 0]
-    apart = 0.5  # distance of each half from the centre, in the largest standard deviations
-    step = apart * whole.scales.gather(1, longest).exp() * axes
-    shrinking = torch.zeros_like(whole.scales).scatter_(
-        1, longest, math.log(math.sqrt(1 - apart**2))
-    )
+    offset = 0.5  # distance of a half from the centre, in units of the largest standard deviation
+    step = offset * whole.scales.gather(1, longest).exp() * axes
+    log_factor = math.log(math.sqrt(1 - offset**2))
+    shrinking = torch.zeros_like(whole.scales).scatter_(1, longest, log_factor)
     doubled = scene[torch.cat([others.nonzero()[:, 0], indices, indices])]
     rest = len(scene) - len(indices)
     means = torch.cat([doubled.means[:rest], whole.means + step, whole.means - step])
-    return doubled.replace(
-        means=means, scales=torch.cat([doubled.scales[:rest], *[whole.scales + shrinking] * 2])
-    )
+    halved = whole.scales + shrinking
+    return doubled.replace(means=means, scales=torch.cat([doubled.scales[:rest], halved, halved]))

@@ -1,4 +1,4 @@
-"""Pruning of a PLY that is larger than memory: which files are, and merging them cell by cell."""
+"""Merges a PLY larger than memory cell by cell, and decides which files need it."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from pointsplat_ns.view_sampling.sampler import Sampler
 
 @dataclass(frozen=True)
 class MemorySettings:
-    """Memory that merging takes, and the sizes of cells that follow from it."""
+    """Memory use of merging, and limits of the cell size."""
 
     cell: int = 400
-    """Bytes for each Gaussian of a cell or of a whole scene in memory, beside its own."""
+    """Bytes of working memory per Gaussian, in addition to its parameters."""
     base: int = 900_000_000
     """Bytes of the interpreter, torch and a thinned scene."""
     most: int = 4_000_000
-    """Largest number of Gaussians in a cell. More memory than it needs changes nothing, so that a
-    result does not depend on the memory that happens to be free."""
+    """Maximum number of Gaussians in a cell. The limit keeps results independent of the memory that
+    happens to be free."""
     least: int = 100_000
-    """Smallest number of Gaussians in a cell."""
+    """Minimum number of Gaussians in a cell."""
 
 
 MEMORY = MemorySettings()
@@ -51,16 +51,17 @@ MEMORY = MemorySettings()
 def rows_to_prune(
     scene: Path, options: PruneOptions, memory: float | None = None
 ) -> PlyRows | None:
-    """The rows of a PLY that has to be merged in cells; None if it is pruned in memory: it fits, or
-    options need it whole.
+    """Rows of a PLY to merge in cells; None to prune in memory, because the scene fits or options
+    need all of it at once.
 
     Args:
         scene: path of a scene.
         options: options of pruning, and of views: a file of cameras, or sampled views.
-        memory: bytes that may be taken; by default what is free.
+        memory: limit in bytes; by default the free memory.
 
     Raises:
-        SceneError: if the file is damaged, or ``memory`` is given and it is no binary 3DGS PLY.
+        SceneError: if the file is damaged, or ``memory`` is given and the file is not a binary 3DGS
+            PLY.
         PointSplatError: if ``memory`` is given and too small for the scene with these options.
     """
     import psutil
@@ -70,26 +71,25 @@ def rows_to_prune(
     if rows is None:
         if memory is not None:
             raise SceneError(
-                f"{scene}: is read as a whole; expected a binary 3DGS PLY for a limit of memory, "
-                "which `pointsplat convert` makes"
+                f"{scene}: cannot be read in parts; expected a binary 3DGS PLY for a limit of "
+                "memory, which `pointsplat convert` writes"
             )
         return None
     size = rows.count * (_row_bytes(rows) + MEMORY.cell)
     limit = psutil.virtual_memory().available if memory is None else memory - MEMORY.base
     if size <= limit:
         return None
-    asked = {
+    whole_scene_options = {
         f"--by {options.by}": options.method.score is not None,
         "--sh auto": options.sh == "auto",
         "--clean": options.clean,
         f"--keep {options.keep}": found_by_trying(options.budget),
     }
-    needing = [name for name, given in asked.items() if given]
+    needing = [name for name, given in whole_scene_options.items() if given]
     if needing and memory is not None:
         raise PointSplatError(
             f"{scene}: {rows.count:,} Gaussians take {bytes_text(size)} of memory with "
-            f"{', '.join(needing)}; expected "
-            "more memory, or merging without these options, which goes by parts"
+            f"{', '.join(needing)}; expected more memory, or merging in parts without these options"
         )
     if needing:
         return None
@@ -104,45 +104,44 @@ def prune_file(
     progress: Progress = silent,
     jobs: int = 1,
 ) -> tuple[int, float]:
-    """Merge a PLY cell by cell. A call that was killed resumes where it was, from a hidden folder
-    beside the output.
+    """Merge a PLY cell by cell. A killed call resumes from a hidden folder beside the output.
 
     Args:
-        rows: the scene, as of :func:`rows_to_prune`.
-        output: the PLY to write.
+        rows: the scene, from :func:`rows_to_prune`.
+        output: PLY to write.
         options: options of pruning, and of views: a file of cameras, or sampled views.
-        memory: bytes that may be taken; more than the largest cell takes change nothing.
+        memory: limit in bytes. Memory beyond the largest cell changes nothing.
         jobs: number of processes that share the cells, each within ``memory``.
 
     Returns:
-        The number of Gaussians before, those that cannot be drawn left out, and seconds.
+        The number of drawable Gaussians before, and the duration in seconds.
 
     Raises:
         PointSplatError: if the memory is too small.
-        SceneError: if a file cannot be read or written, or the disk has no room for what lies
-            between.
+        SceneError: if a file cannot be read or written, or the disk has no room for temporary
+            files.
         BudgetError: if the budget does not fit the scene.
-        DataError: if the cameras are not usable, or the number of jobs is not valid.
+        DataError: if the cameras are not usable, or the number of jobs is invalid.
     """
     start = time.perf_counter()
     check_jobs(jobs)
     if output.suffix.lower() != ".ply":
         raise SceneError(
-            f"{output}: is written as a whole; expected a .ply for a scene larger than memory, "
-            "which `pointsplat convert` changes"
+            f"{output}: cannot be written in parts; expected a .ply for a scene larger than "
+            "memory, which `pointsplat convert` converts"
         )
     if options.sh.isdigit():
         rows = rows.with_sh_degree(int(options.sh))
     most = MEMORY.most
     if memory is not None:
-        each = _row_bytes(rows) + MEMORY.cell
-        needed = MEMORY.base + MEMORY.least * each
+        bytes_per_gaussian = _row_bytes(rows) + MEMORY.cell
+        needed = MEMORY.base + MEMORY.least * bytes_per_gaussian
         if memory < needed:
             raise PointSplatError(
                 f"memory of {bytes_text(memory)} is too small; expected at least "
                 f"{bytes_text(needed)}"
             )
-        most = min(most, int((memory - MEMORY.base) / each))
+        most = min(most, int((memory - MEMORY.base) / bytes_per_gaussian))
     given = None if options.sampled else options.poses
     resolution = options.size
     up = options.upward
@@ -176,10 +175,9 @@ def prune_file(
         assert count is not None
         return count
 
-    count = count_of(rows.count)  # errors before the work
-    size = rows.count * (_row_bytes(rows) + 150) + count * _row_bytes(
-        rows
-    )  # 150 bytes for each between rounds
+    count = count_of(rows.count)  # raises errors before the long work
+    # Between rounds, every Gaussian takes 150 bytes.
+    size = rows.count * (_row_bytes(rows) + 150) + count * _row_bytes(rows)
     scratch = Scratch(output.with_name(f".{output.name}.cells"), work, size)
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
     with scratch.left_if_useful():

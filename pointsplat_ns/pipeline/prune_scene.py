@@ -1,7 +1,7 @@
-"""Pruning with all options: cleaning and SH bands first, then a method and a budget.
+"""Prunes a scene with all options: SH bands and cleaning first, then a method and a budget.
 
-Views are read or sampled only where they are needed: for a budget in dB, ``auto`` SH, a method that
-scores by views, or cleaning that removes a Gaussian.
+Views are read or sampled only if needed: by a budget in dB, ``auto`` SH, a method that scores in
+views, or cleaning that removes a Gaussian.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ from pointsplat_ns.system.progress import Progress, silent
 
 @dataclass(frozen=True, eq=False)
 class Pruned:
-    """A smaller scene, and how it was found."""
+    """A pruned scene, and how it was made."""
 
     scene: Gaussians
     sh: ShCut | None = None
-    """The SH bands that were cut; None if all were asked for."""
+    """Cut SH bands; None if all bands are requested."""
     cleaning: Cleaning | None = None
-    """What cleaning removed; None if it was not asked for."""
+    """Result of cleaning; None if not requested."""
     search: PsnrSearch | SizeSearch | None = None
-    """The search for the count; None if it follows from the budget."""
+    """Search for the count; None if the budget determines the count."""
     limit: FileLimit | None = None
-    """The limit of a compressed file, and the rounding that meets it; None for another budget."""
+    """Limit of a compressed file, with the rounding that meets it; None for other budgets."""
 
 
 def prune_scene(
@@ -63,10 +63,11 @@ def prune_scene(
     progress: Progress = silent,
     rounding: bool = True,
 ) -> Pruned:
-    """Make a scene smaller, by default with sampled views. Its numbers are rounded for the size of
-    a compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met,
-    SceneError if no Gaussian of the scene can be drawn, and DataError if views are needed and there
-    are none."""
+    """Prune a scene, by default with sampled views.
+
+    With the size of a compressed file as the budget, values are rounded unless ``rounding`` is
+    False. Raises BudgetError if the budget cannot be met, SceneError if no Gaussian can be drawn,
+    and DataError if views are needed and there are none."""
     ReductionOptions.check(options)
     need_usable(dense)
     views = views or ViewProvider(dense)
@@ -96,7 +97,7 @@ def prune_scene(
 
         def make(count: int) -> Gaussians:
             if cleaning is not None and count > len(start):
-                return cleaning.apply(full, count)  # with the most opaque of the junk
+                return cleaning.apply(full, count)  # with the most opaque junk
             return merger.merged(count).scene if merging else start[select(scores, count)]
 
         searching = functools.partial(progress, "trying counts")
@@ -114,8 +115,7 @@ def prune_scene(
 def _with_sh(
     dense: Gaussians, sh: str, views: ViewProvider, progress: Progress
 ) -> tuple[Gaussians, ShCut | None]:
-    """The scene with the SH bands that ``sh`` keeps, and what was cut; None if all are asked
-    for."""
+    """The scene with the SH bands of ``sh``, and the cut; None if all bands are requested."""
     if sh == "all":
         return dense, None
     reached = None
@@ -145,9 +145,11 @@ def _for_psnr(
     views: ViewProvider,
     progress: Callable[[float], None],
 ) -> tuple[Gaussians, FileLimit | None, PsnrSearch]:
-    """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit
-    of its file: the scene has the PSNR when it is rounded; and the search. ``make(n)`` returns n
-    Gaussians."""
+    """The smallest scene that reaches a PSNR against ``dense``, the limit of its file, and the
+    search.
+
+    For a format that rounds, the rounded scene reaches the PSNR; for others the limit is None.
+    ``make(n)`` returns n Gaussians."""
     judge = Judge(dense, views)
     kind = format_to_write(budget.suffix)
     limit = (
@@ -177,8 +179,8 @@ def _for_size(
     views: ViewProvider,
     progress: Callable[[float], None],
 ) -> tuple[Gaussians, FileLimit, SizeSearch]:
-    """The largest scene whose compressed file has a size, before rounding, the rounding, and the
-    search; ``start`` is the largest scene allowed, ``make(n)`` returns n Gaussians."""
+    """The largest scene whose compressed file meets a size, unrounded; the limit with its rounding;
+    and the search. ``start`` is the largest allowed scene, ``make(n)`` returns n Gaussians."""
     limit = FileLimit(format_to_write(budget.suffix), budget.bytes)
     try:
         reference = DenseReference(dense, views.compared())

@@ -1,11 +1,11 @@
-"""How close a written scene is to the dense scene: one judgement, reported identically by commands,
-pages and pictures.
+"""Judges how close a written scene is to the dense scene, identically for commands, pages and
+pictures.
 
 Renders are compared in the views of
-:meth:`~pointsplat_ns.pipeline.view_provider.ViewProvider.whole`, at the size that people look at,
-in few of their pixels. For PSNR these are every k-th
-(:mod:`~pointsplat_ns.rendering.comparison.sizes`). SSIM needs neighbours, so it takes bands of rows
-of each view, at other heights in each.
+:meth:`~pointsplat_ns.pipeline.view_provider.ViewProvider.whole`, at the size that people view, in a
+sample of their pixels. PSNR takes every k-th pixel
+(:mod:`~pointsplat_ns.rendering.comparison.sizes`). SSIM needs neighbouring pixels, so it takes
+bands of rows, at different heights in every view.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from pointsplat_ns.system.threads import one_thread_each
 
 @dataclass(frozen=True)
 class JudgingSettings:
-    """Pixels that are drawn of a view of 1920 x 1080 pixels."""
+    """Pixels to draw of a view of 1920 x 1080 pixels."""
 
     side: int = 240
     """Longer side of the subsampled picture for PSNR, pixels."""
     bands: int = 2
-    """Number of bands of rows for SSIM. It is within 0.01 of that of whole pictures in two rooms
-    and a statue, 0.03 in a robot on gravel; with one band within 0.03."""
+    """Number of bands of rows for SSIM. Two bands deviate from whole pictures by at most 0.01 in
+    two rooms and a statue, and 0.03 in a robot on gravel; one band by 0.03."""
     band_rows: int = 13
-    """Least number of rows of a band; SSIM takes windows of 11."""
+    """Minimum number of rows of a band; SSIM takes windows of 11."""
     band_pixels: int = 24_960
     """Pixels of a band; narrower pictures have more rows."""
 
@@ -53,16 +53,16 @@ JUDGING = JudgingSettings()
 
 @dataclass(frozen=True)
 class PhotoGain:
-    """What training on photos gained."""
+    """Gain of training on photos."""
 
     before: float
-    """PSNR in the compared photos before, dB."""
+    """PSNR in the compared photos before training, dB."""
     after: float
-    """The same after."""
+    """The same after training, dB."""
     photos: int
-    """Number of the compared photos."""
+    """Number of compared photos."""
     accepted: bool
-    """Whether the scene after it is the result."""
+    """Whether the trained scene is the result."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Quality:
     """How close a scene is to the dense scene."""
 
     psnr: float
-    """PSNR over the pixels that the dense scene covers, dB; inf if nothing differs."""
+    """PSNR over the pixels that the dense scene covers, dB; inf for equal renders."""
     worst: float
     """The same of the worst view, dB."""
     ssim: float | None
     """SSIM over the pixels on which the dense scene draws anything, in [-1, 1]; None for pictures
-    below its window."""
+    smaller than its window."""
     views: int
     """Number of views."""
     width: int
@@ -83,15 +83,15 @@ class Quality:
     height: int
     """Height of their pictures, pixels."""
     origin: ViewOrigin | None
-    """Where the views came from."""
+    """Origin of the views."""
     fill_before: float
-    """Mean number of Gaussians of the dense scene that viewers draw on a pixel."""
+    """Mean number of Gaussians of the dense scene that viewers draw per pixel."""
     fill: float
     """The same of the scene."""
     photos: PhotoGain | None = None
-    """What photos say, if the scene was trained on some."""
+    """Gain of training on photos; None without training."""
     opacity: float = 1.0
-    """Mean opacity of the dense scene, in [0, 1], where it draws anything."""
+    """Mean opacity of the dense scene on the pixels where it draws anything, in [0, 1]."""
 
 
 class Judge:
@@ -102,7 +102,7 @@ class Judge:
         source: source of views.
 
     Raises:
-        DataError: if there is no place to look from.
+        DataError: if no view can be found.
     """
 
     def __init__(self, dense: Gaussians, source: ViewProvider):
@@ -124,9 +124,9 @@ class Judge:
             return None
         rows = min(views.height, max(JUDGING.band_rows, JUDGING.band_pixels // views.width))
         views = views[torch.arange(len(views), **INDICES).repeat_interleave(JUDGING.bands)]
-        tops = (0.618 * torch.arange(len(views), **DOUBLES)).frac() * (
-            views.height - rows
-        )  # spread evenly
+        # Multiples of the golden ratio spread evenly.
+        shares = (0.618 * torch.arange(len(views), **DOUBLES)).frac()
+        tops = shares * (views.height - rows)
         Ks = views.Ks.clone()
         Ks[:, 1, 2] -= tops.round().to(Ks)
         return DenseReference(self.dense, replace(views, Ks=Ks, height=rows))
@@ -137,9 +137,9 @@ class Judge:
         """PSNR of a scene over all views, and of the worst view, dB."""
         return self._pixels.psnr(self._placed(scene), progress)
 
-    @one_thread_each()  # views are drawn at once, and what is left are small operations
+    @one_thread_each()  # views are drawn in parallel; the remaining operations are small
     def quality(self, scene: Gaussians) -> Quality:
-        """The judgement of a scene."""
+        """Judge a scene."""
         psnr, worst = self.psnr(scene)
         similarity = None
         if self._bands is not None:
@@ -166,12 +166,12 @@ class Judge:
 
 
 def quality_of_file(judge: Judge | None, scene: Gaussians, path: Path) -> Quality | None:
-    """The quality of a scene as it is in the file that it was written to; None without a judge."""
+    """Quality of a scene as stored in its file; None without a judge."""
     return None if judge is None else judge.quality(read_back(scene, path, format_to_write(path)))
 
 
 def judge_of(dense: Gaussians, source: ViewProvider) -> Judge | None:
-    """The judge of a scene; None if there is no place to look from."""
+    """The judge of a scene; None if no view can be found."""
     try:
         return Judge(dense, source)
     except DataError:
@@ -179,24 +179,22 @@ def judge_of(dense: Gaussians, source: ViewProvider) -> Judge | None:
 
 
 def read_back(scene: Gaussians, path: Path, kind: Format) -> Gaussians:
-    """The scene in a file of a format, which ``scene`` was written to; ``scene`` itself where
-    nothing is lost, or nothing reads the format."""
-    return (
-        scene
-        if kind.suffix == ".ply" or kind.read is None
-        else usable_part(kind.read(path)).to(scene.device)
-    )
+    """The scene as stored in a file; ``scene`` itself if the format is lossless or cannot be
+    read."""
+    if kind.suffix == ".ply" or kind.read is None:
+        return scene
+    return usable_part(kind.read(path)).to(scene.device)
 
 
 def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
-    """The size of a scene's file of a suffix such as ``.spz`` in bytes, and the scene after writing
-    and reading (:func:`read_back`)."""
+    """File size in bytes, and the scene after writing and reading (:func:`read_back`), for a suffix
+    such as ``.spz``."""
     kind = format_to_write(suffix)
     if kind.suffix == ".ply":
         return ply_bytes(len(scene), scene.sh_degree), scene
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene{suffix}"
         assert kind.write is not None
-        # Without the warning of losses, which is for the scene that is kept.
+        # Without the warning of losses, which is for the final scene.
         kind.write(usable_part(scene.detach().to("cpu", torch.float32)), path, silent)
         return path.stat().st_size, read_back(scene, path, kind)

@@ -1,4 +1,4 @@
-"""Why a change to a scene is left out."""
+"""Reasons to reject a change to a scene."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import Enum
 
 
 class Cause(Enum):
-    """Kinds of reasons for which a stage is left out."""
+    """Causes for which a stage is rejected."""
 
     NO_CHANGE = "no change"
     NO_GAIN = "no gain"
@@ -21,14 +21,14 @@ class Cause(Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """Why a stage is left out, with its numbers."""
+    """A cause to reject a stage, with its numbers."""
 
     cause: Cause
     count: int = 0
     """Number of Gaussians that are not finite."""
     total: int = 0
-    """Number of Gaussians of which they are."""
+    """Number of all Gaussians."""
     decibels: float = 0.0
-    """Least gain that counts, or what other photos lose, dB."""
+    """Minimum gain, or loss in other photos, dB."""
     error: str = ""
-    """The error for which nothing was compared."""
+    """Error that prevented the comparison."""

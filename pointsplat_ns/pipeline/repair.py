@@ -1,5 +1,4 @@
-"""Repairs a smaller scene by learned optimisation steps against renders of the dense scene, each in
-another view."""
+"""Repairs a smaller scene by learned optimisation steps against renders of the dense scene."""
 
 from __future__ import annotations
 
@@ -15,10 +14,10 @@ from typing import Literal
 from torch import Tensor
 
 from pointsplat_ns.pipeline.feedback_features import REPAIR, Feedback
-from pointsplat_ns.pipeline.optimiser import TOGETHER, optimised
+from pointsplat_ns.pipeline.optimiser import VIEWS_AT_ONCE, optimised
 from pointsplat_ns.pipeline.photos.examples import Example, render_of
 from pointsplat_ns.pipeline.repair_budget import RepairBudget
-from pointsplat_ns.pipeline.repair_state import Unfinished
+from pointsplat_ns.pipeline.repair_state import RepairStateFile
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.refinement.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.refinement.schedules import cosine_factor
@@ -47,27 +46,26 @@ def repair(
     psnr: float = 0.0,
     unfinished: Path | None = None,
 ) -> Repaired:
-    """Optimise a smaller scene against renders of the dense one; its number of Gaussians does not
+    """Optimise a smaller scene against renders of the dense one. The number of Gaussians does not
     change.
 
     Each step renders both scenes in one view. A network reads the gradients of each Gaussian and
-    sets how far it moves (:mod:`~pointsplat_ns.refinement.feedback`). The views come from
-    :meth:`ViewProvider.others`: other views than those of comparisons, each once before any is
-    repeated. Ctrl-C ends the repair, and the scene of the last step is returned.
+    sets its step length (:mod:`~pointsplat_ns.refinement.feedback`). Views come from
+    :meth:`ViewProvider.others`, which excludes views of comparisons. Ctrl-C ends the repair; the
+    result is the scene of the last step.
 
     Args:
         scene: K Gaussians; not changed.
         dense: N Gaussians on the same device.
         views: source of views.
-        budget: length of the repair, for a scene of few Gaussians; see
-            :meth:`RepairBudget.for_count`.
+        budget: length of the repair, before :meth:`RepairBudget.for_count`.
         progress: called with the share done, in [0, 1].
-        network: on the scene's device; by default the shipped one, None for plain Adam.
+        network: network on the scene's device; by default the shipped one; None for plain Adam.
         psnr: PSNR of ``scene`` over the pixels that the dense scene covers, dB. Above
-            ``REPAIR.nearly_right`` the steps are smaller.
-        unfinished: a file for the state of a repair of a number of steps, each minute. If it is
-            there, and of the same repair, the steps continue from it, to the same bits. The caller
-            removes it.
+            ``REPAIR.nearly_right``, steps are smaller.
+        unfinished: file for the state of a repair with a number of steps, written every minute. If
+            it exists and is of the same repair, the repair continues from it, bit for bit. The
+            caller removes the file.
 
     Raises:
         DataError: if nothing of the scene is visible.
@@ -79,14 +77,14 @@ def repair(
     feedback = Feedback(scene, len(dense))
     first_factor = budget.rate * initial_rate_factor(psnr)
     work = len(dense), budget, psnr, views.compared().viewmats.tolist()
-    file = Unfinished(None if budget.seconds is not None else unfinished, scene, work)
+    file = RepairStateFile(None if budget.seconds is not None else unfinished, scene, work)
 
     def state_of(scene: Gaussians) -> dict[str, Tensor]:
         return {**feedback.state(), **dict(scene.items())}
 
-    found = file.state(state_of(scene))
-    if found is not None:
-        run.count, state = found
+    resumed = file.state(state_of(scene))
+    if resumed is not None:
+        run.count, state = resumed
         run.done = budget.share_done(run.count, 0.0)
         feedback.restore(state, run.count)
         scene = scene.replace(**{name: state[name] for name, _ in scene.items()})
@@ -101,14 +99,15 @@ def repair(
             factors = feedback.factors(network, scene, run.done, expected)
         return first_factor * cosine_factor(run.done, REPAIR.last_factor), factors
 
-    def kept(scenes: Iterator[Gaussians], first: int) -> Iterator[Gaussians]:
+    def saving_state(scenes: Iterator[Gaussians], first: int) -> Iterator[Gaussians]:
         for count, scene in enumerate(scenes, first + 1):
-            if count % TOGETHER == 0:
+            if count % VIEWS_AT_ONCE == 0:
                 file.save(count, functools.partial(state_of, scene))
             yield scene
 
     examples = _examples(dense, views, budget.growth, run.count)
-    last = run.take(scene, kept(optimised(scene, feedback, examples, choose), run.count), progress)
+    scenes = saving_state(optimised(scene, feedback, examples, choose), run.count)
+    last = run.take(scene, scenes, progress)
     return Repaired(last, run.count, run.seconds, run.interrupted)
 
 
@@ -119,7 +118,7 @@ class OptimisationRun:
     budget: RepairBudget
     count: int = 0
     done: float = 0.0
-    """Used share of the budget; 1 or more at the end."""
+    """Spent share of the budget; 1 or more at the end."""
     interrupted: bool = False
     """Whether Ctrl-C ended the steps early."""
 
@@ -137,11 +136,11 @@ class OptimisationRun:
         scenes: Iterator[Gaussians],
         progress: Callable[[float], None] | None = None,
     ) -> Gaussians:
-        """The scene after the last step: take steps until the budget is used, or Ctrl-C.
+        """Take steps until the budget is spent, or Ctrl-C. Returns the scene after the last step.
 
         Args:
             scene: the scene before the first step.
-            scenes: the scene after each step, without end.
+            scenes: the scene after each step, endless.
             progress: called with the share done, in [0, 1].
         """
         try:
@@ -159,26 +158,23 @@ class OptimisationRun:
 def _examples(
     dense: Gaussians, views: ViewProvider, growth: float, taken: int = 0
 ) -> Iterator[Callable[[], Example]]:
-    """Views after those ``taken``, and renders of the dense scene in them, without end.
+    """Views and renders of the dense scene, endless; the first ``taken`` are skipped.
 
-    For ``growth`` times the steps, there are so many times the sampled views and pixels: a large
-    scene has more Gaussians between the pixels, and its projection takes most of the time. A view
-    that comes again is not drawn again, as long as it is among the last 256, or fewer of more
-    pixels.
+    Numbers of sampled views and of pixels grow with ``growth``, as the steps do: a large scene has
+    more Gaussians between the pixels, and its projection takes most of the time. The last 256
+    renders are cached, fewer if they are larger.
     """
     count = round(growth * VIEW_COUNTS.stepped)
     side = round(math.sqrt(growth) * SMALLEST_SIDE)
-
-    drawn = functools.lru_cache(maxsize=round(256 / growth))(
-        render_of
-    )  # 0.2 GB where pictures are 16 to 9
+    # 256 renders of 16:9 take 0.2 GB.
+    drawn = functools.lru_cache(maxsize=round(256 / growth))(render_of)
     others = itertools.islice(views.others(count=count, drawn_side=side), taken, None)
     return (functools.partial(drawn, dense, view) for view in others)
 
 
 def initial_rate_factor(psnr: float) -> float:
-    """Factor on all learning rates for a scene of some PSNR, dB: 1 up to ``REPAIR.nearly_right``,
-    then proportional to the root mean square error.
+    """Factor on all learning rates, from the PSNR of the scene before repair, dB: 1 up to
+    ``REPAIR.nearly_right``, then proportional to the root mean square error.
 
     Example:
         >>> [round(initial_rate_factor(psnr), 3) for psnr in (20, 35, 41, 55)]

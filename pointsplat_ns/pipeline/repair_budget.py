@@ -1,4 +1,4 @@
-"""Lengths of repairs: steps by effort, or seconds."""
+"""Length of a repair: steps by effort, or seconds."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from pointsplat_ns.errors import PointSplatError
 Effort = Literal["instant", "quick", "thorough"]
 
 STEPS: dict[Effort, int] = {"instant": 0, "quick": 192, "thorough": 1200}
-"""Number of repair steps of each effort, for at most :data:`FEW` Gaussians."""
+"""Repair steps by effort, for at most :data:`FEW_GAUSSIANS` Gaussians."""
 
-FEW = 20_000
+FEW_GAUSSIANS = 20_000
 """Number of Gaussians above which a repair takes more steps, in more views."""
 
 PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 2400, "thorough": 12000}
-"""Number of training steps on photos of each effort."""
+"""Training steps on photos by effort."""
 
 
 @dataclass(frozen=True)
 class RepairBudget:
-    """Length of a repair, in steps or seconds. Raises PointSplatError if it is not a positive time
-    or one of :data:`STEPS`."""
+    """Length of a repair, in steps or seconds. Raises PointSplatError if the effort is not one of
+    :data:`STEPS`, or the time is negative or infinite."""
 
     effort: Effort = "quick"
-    """Number of steps, see :data:`STEPS`. The result does not depend on the speed of the
-    machine."""
+    """Name of a number of steps, see :data:`STEPS`. The result does not depend on the machine's
+    speed."""
     seconds: float | None = None
-    """Wall-clock time, in place of ``effort``. The result depends on the speed of the machine."""
+    """Wall-clock time in place of ``effort``. The result depends on the machine's speed."""
     growth: float = 1.0
-    """Factor on the number of steps, and of sampled views."""
+    """Factor on the numbers of steps and sampled views."""
     rate: float = 1.0
     """Factor on the learning rates."""
 
@@ -49,9 +49,9 @@ class RepairBudget:
     def for_count(self, count: int) -> RepairBudget:
         """The budget for a scene of ``count`` Gaussians.
 
-        Steps grow with the square root of the count, up to four times as many: a view of a large
-        scene shows more Gaussians, and a smaller share of them. Above that, each Gaussian is seen
-        in fewer steps and moves equally far in each, whatever the pixel, so learning rates fall.
+        Steps grow with the square root of the count, up to a factor of four: a view of a large
+        scene shows more Gaussians, but a smaller share of them. Beyond that, fewer steps show a
+        Gaussian, which moves equally far in each, so learning rates fall instead.
 
         Example:
             >>> counts = (5_000, 80_000, 320_000, 3_200_000)
@@ -60,8 +60,8 @@ class RepairBudget:
             [(1.0, 1.0), (2.0, 1.0), (4.0, 1.0), (4.0, 0.1)]
         """
         most = 4.0
-        growth = min(max(math.sqrt(count / FEW), 1.0), most)
-        return replace(self, growth=growth, rate=min(1.0, most**2 * FEW / count))
+        growth = min(max(math.sqrt(count / FEW_GAUSSIANS), 1.0), most)
+        return replace(self, growth=growth, rate=min(1.0, most**2 * FEW_GAUSSIANS / count))
 
     @property
     def empty(self) -> bool:
@@ -69,7 +69,7 @@ class RepairBudget:
         return self.seconds == 0 if self.seconds is not None else self.steps == 0
 
     def share_done(self, steps: int, seconds: float) -> float:
-        """Used share of the budget after ``steps`` steps and ``seconds`` seconds; 1 or more at the
+        """Spent share of the budget after ``steps`` steps and ``seconds`` seconds; 1 or more at the
         end. The budget must not be empty."""
         return seconds / self.seconds if self.seconds is not None else steps / self.steps
 

@@ -1,5 +1,4 @@
-"""The state of a long repair in a file, from which the same command continues after it was
-killed."""
+"""State file of a long repair: the same command resumes from it after it was killed."""
 
 from __future__ import annotations
 
@@ -21,24 +20,25 @@ from pointsplat_ns.system.outputs import is_own_file
 logger = logging.getLogger("pointsplat_ns")
 
 
-class Unfinished:
-    """A file with the state after some of the steps of one repair.
+class RepairStateFile:
+    """File with the state of an unfinished repair.
 
     Args:
-        path: the file; None for none. Nobody named it: a symbolic link there is not followed.
+        path: the file; None for none. The name is automatic, so a symbolic link there is not
+            followed.
         scene: K Gaussians before the first step.
-        work: all else that the steps depend on; its text tells repairs apart. So do the versions of
-            this package and of torch.
+        work: everything else that the steps depend on. Its text identifies the repair, together
+            with the versions of this package and of torch.
     """
 
     SECONDS = 60.0
-    """Time between two states that are written. A shorter repair writes none."""
+    """Time between two writes. A shorter repair writes nothing."""
 
     def __init__(self, path: Path | None, scene: Gaussians, work: object):
         self._path = path
         self._written = time.monotonic()
         if path is not None:
-            # Steps of another version may differ: the repair would be of neither.
+            # Steps of another version may differ; a mixed repair would belong to neither.
             versions = pointsplat_ns.__version__, torch.__version__
             digest = hashlib.sha256(repr((versions, work)).encode())
             for value in scene.tensors():
@@ -46,8 +46,8 @@ class Unfinished:
             self._key = digest.hexdigest()
 
     def state(self, like: Mapping[str, Tensor]) -> tuple[int, dict[str, Tensor]] | None:
-        """Number of steps and tensors, on the devices of those in ``like``, which have the same
-        names, shapes and dtypes; None if there is no file, or it is of another repair."""
+        """Number of steps, and tensors with the names, shapes, dtypes and devices of ``like``; None
+        if there is no file of this repair."""
         if self._path is None or not is_own_file(self._path):
             return None
         from safetensors import SafetensorError, safe_open
@@ -60,7 +60,7 @@ class Unfinished:
                 tensors = {name: file.get_tensor(name) for name in like}
             count = int(header["steps"])
         except (OSError, KeyError, ValueError, SafetensorError) as error:
-            logger.warning("%s: damaged (%s); the repair starts again", self._path, one_line(error))
+            logger.warning("%s: damaged (%s); the repair starts over", self._path, one_line(error))
             return None
         fits = all(
             (tensors[name].shape, tensors[name].dtype) == (own.shape, own.dtype)
@@ -68,12 +68,12 @@ class Unfinished:
         )
         if count < 1 or not fits:
             return None
-        logger.info("%s: the repair continues after %d steps", self._path, count)
+        logger.info("%s: the repair resumes after %d steps", self._path, count)
         return count, {name: value.to(like[name].device) for name, value in tensors.items()}
 
     def save(self, count: int, tensors: Callable[[], Mapping[str, Tensor]]) -> None:
-        """Write the tensors after ``count`` steps, if the last time is long ago. If they cannot be
-        written, a warning says so, and no more are."""
+        """Write the tensors after ``count`` steps, unless the last write is recent. A failed write
+        is logged as a warning, and is the last attempt."""
         if self._path is None or time.monotonic() - self._written < self.SECONDS:
             return
         try:
@@ -81,7 +81,7 @@ class Unfinished:
             write_tensors(self._path, tensors(), header, named=False)
         except (OSError, SceneError) as error:
             logger.warning(
-                "%s: not written (%s); if this is killed, the repair is lost",
+                "%s: not written (%s); a killed repair cannot resume",
                 self._path,
                 one_line(error),
             )

@@ -1,4 +1,4 @@
-"""Results of a request, in numbers: :class:`Report`, and what each stage did to the scene."""
+"""Results of a request in numbers: :class:`Report`, with a :class:`StageResult` per stage."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ StageName = Literal["merge", "prune", "refine", "repair", "photos", "round"]
 
 @dataclass(frozen=True, eq=False)
 class StageResult:
-    """What one stage did to a scene."""
+    """The result of one stage."""
 
     stage: StageName
     scene: Gaussians
     """The scene after the stage."""
     after: Closeness | None
-    """Errors of ``scene`` against the dense scene's renders; None if it was not compared."""
+    """Errors of ``scene`` against renders of the dense scene; None if not compared."""
     before: Closeness | None = None
     """Errors of the scene before the stage; None for pruning."""
     reason: Reason | None = None
-    """Why the stage is left out; None if it is accepted."""
+    """Reason to reject the stage; None if it is accepted."""
     steps: int = 0
     """Number of steps of a repair."""
     seconds: float = 0.0
@@ -41,7 +41,7 @@ class StageResult:
     interrupted: bool = False
     """Whether Ctrl-C ended a repair early."""
     photos: PhotoRepaired | None = None
-    """Figures of a training on photos."""
+    """Figures of training on photos."""
 
     @property
     def accepted(self) -> bool:
@@ -50,27 +50,27 @@ class StageResult:
 
 
 def last_accepted(results: Sequence[StageResult]) -> StageResult:
-    """The result of the last stage that was accepted."""
+    """The result of the last accepted stage."""
     return next(result for result in reversed(results) if result.accepted)
 
 
 @dataclass(frozen=True)
 class ShCut:
-    """The SH bands that were cut."""
+    """A cut of SH bands."""
 
     before: int
     """SH degree of the dense scene."""
     after: int
     """SH degree of the result."""
     lost: float = 0.0
-    """Share of the colours' change with the view that is lost, in [0, 1]."""
+    """Lost share of the view-dependent colour, in [0, 1]."""
     psnr: float | None = None
-    """PSNR of renders against those with all bands, dB; None if it was not asked for."""
+    """PSNR of renders against those with all bands, dB; None if not measured."""
 
 
 @dataclass(frozen=True)
 class PsnrSearch:
-    """The search for the smallest scene of a PSNR."""
+    """A search for the smallest scene that reaches a PSNR."""
 
     tried: int
     """Number of sizes that were tried."""
@@ -84,19 +84,19 @@ class PsnrSearch:
 
 @dataclass(frozen=True)
 class SizeSearch:
-    """The search for the largest scene that fits a compressed file."""
+    """A search for the largest scene that fits a compressed file."""
 
     tried: int
     """Number of sizes that were tried."""
     bytes: float
-    """Largest size of the file."""
+    """Maximum size of the file."""
     format: str
-    """Name of its format."""
+    """Name of the file's format."""
 
 
 @dataclass(frozen=True)
 class TargetSearch:
-    """The search for the smallest file that has a quality after all stages."""
+    """A search for the smallest file that reaches a quality after all stages."""
 
     psnr: float
     """PSNR of the file, dB: in held-out photos if ``photos`` is above 0, else against the dense
@@ -105,9 +105,9 @@ class TargetSearch:
     """Size of the file."""
     gaussians: int
     photos: int = 0
-    """Number of the held-out photos that judge; 0 if renders of the dense scene do."""
+    """Number of held-out photos to judge by; 0 to judge by renders of the dense scene."""
     dense_psnr: float = 0.0
-    """PSNR of the dense scene in these photos, dB."""
+    """PSNR of the dense scene in the held-out photos, dB."""
     tried: int = 0
     """Number of sizes that were tried."""
     interrupted: bool = False
@@ -131,8 +131,8 @@ class Report:
     """The result of a request: a smaller scene, and figures of every stage."""
 
     stages: tuple[StageResult, ...]
-    """Pruning, then refinement, repair and rounding where they were tried. Scenes are on the dense
-    scene's device. Empty if the result was written without being read (``written``)."""
+    """Results of pruning, then of refinement, repair and rounding if they ran. Scenes are on the
+    dense scene's device. Empty if the result is only in a file (``written``)."""
     by: str
     """The method of pruning."""
     count_before: int
@@ -140,44 +140,44 @@ class Report:
     seconds: float
     """Total duration."""
     origin: ViewOrigin | None = None
-    """Where views came from; None if none were needed."""
+    """Origin of the views; None if none were needed."""
     sh: ShCut | None = None
-    """The SH bands that were cut; None if all were asked for."""
+    """Cut of SH bands; None if all bands are requested."""
     cleaning: Cleaning | None = None
-    """What cleaning removed; None if it was not asked for."""
+    """Result of cleaning; None if not requested."""
     search: PsnrSearch | SizeSearch | None = None
-    """The search for the count of a budget; None if the count follows from the budget."""
+    """Search for the count of a budget; None if the budget determines the count."""
     target: TargetSearch | None = None
-    """The search for a quality after all stages; None if there was none."""
+    """Search for a quality after all stages; None if there was none."""
     reference: DenseReference | None = None
-    """Renders of the dense scene, for comparison with each stage; None if there are no views."""
+    """Renders of the dense scene for comparison; None if there are no views."""
     uncompared: str = ""
-    """The error for which renders cannot be compared; empty if they are."""
+    """Error that prevents comparison of renders; empty if they are compared."""
     judge: Judge | None = None
-    """The judge of a search for a quality; None if there was none."""
+    """Judge of a search for a quality; None without a search."""
     held_out: HeldOut | None = None
     """PSNR in held-out photos; None if there are none."""
     no_held_out: str = ""
-    """The error for which there are no held-out photos; empty if they were not asked for."""
+    """Error for which there are no held-out photos; empty if not requested."""
     interrupted: bool = False
     """Whether Ctrl-C ended the repair or a search early."""
     written: Path | None = None
-    """The file of the result, if a scene larger than memory was merged into it."""
+    """File of the result, if the scene was larger than memory."""
     dense: Gaussians | None = field(default=None, repr=False)
     """The dense scene; None if it is larger than memory."""
 
     def stage(self, name: StageName) -> StageResult | None:
-        """The result of the first stage of a name; None if there was none."""
+        """The first result of a stage; None if it did not run."""
         return next((result for result in self.stages if result.stage == name), None)
 
     @property
     def last(self) -> StageResult:
-        """The last stage that was accepted."""
+        """The last accepted stage."""
         return last_accepted(self.stages)
 
     @property
     def scene(self) -> Gaussians:
-        """The result: the scene after the last stage that was accepted."""
+        """The result: the scene after the last accepted stage."""
         return self.last.scene
 
     @property
@@ -203,7 +203,7 @@ class Report:
 
     @property
     def photo_gain(self) -> PhotoGain | None:
-        """What training on photos gained; None if there was none."""
+        """Gain of training on photos; None if there was none."""
         from pointsplat_ns.pipeline.quality import PhotoGain
 
         result = self.stage("photos")
@@ -223,11 +223,11 @@ class Report:
 
     @property
     def psnr(self) -> float | None:
-        """PSNR of ``scene`` against the dense scene's renders over the pixels that the dense scene
-        covers, dB; None if nothing was compared."""
+        """PSNR of ``scene`` against the dense scene, over the pixels that the dense scene covers,
+        dB; None if not compared."""
         return None if self.last.after is None else self.last.after.psnr
 
     @property
     def views(self) -> Views | None:
-        """The views that renders were compared in."""
+        """The views in which renders were compared."""
         return None if self.reference is None else self.reference.views

@@ -1,5 +1,5 @@
-"""Runs one request, from the scene's file to a report: the one way through the package, for the
-public functions and the commands alike."""
+"""Runs a request from the scene's file to a report, for both the public functions and the
+commands."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ from pointsplat_ns.system.tensors import normal_mode
 
 
 @dataclass(frozen=True, eq=False)
-class Done:
+class Outcome:
     """A finished request."""
 
     report: Report
     views: ViewProvider | None
-    """The views that decided; None if the scene is larger than memory."""
+    """Source of the views; None if the scene is larger than memory."""
 
     @property
     def judge(self) -> Judge | None:
-        """Judges files of the result; None if there is no place to look from."""
+        """Judge of the result's file; None if no view can be found."""
         if self.report.judge is not None or self.report.dense is None or self.views is None:
             return self.report.judge
         return judge_of(self.report.dense, self.views)
@@ -59,16 +59,16 @@ def prune(
     memory: float | None = None,
     jobs: int | None = None,
     progress: bool | Progress = False,
-) -> Done:
+) -> Outcome:
     """Read a scene and prune it. A PLY that does not fit into memory is merged in cells.
 
     Args:
         scene: N Gaussians, or the path of a scene.
-        options: what to keep, and where to look from.
+        options: budget, method and views.
         views: known views, in place of ``options.poses``.
-        output: the PLY that a scene larger than memory is merged into, and beside it a hidden
-            folder from which a killed call continues; by default a temporary file, which is read.
-        memory: bytes that may be taken; by default what is free.
+        output: PLY for the result of a scene larger than memory; a hidden folder beside it lets a
+            killed call resume. By default a temporary file, which is then read.
+        memory: limit in bytes; by default the free memory.
         jobs: number of processes that share the cells, each within ``memory``.
         progress: True shows a bar; a function is called with the current task and its share done.
 
@@ -81,7 +81,7 @@ def prune(
         rows = rows_to_prune(Path(scene), options, memory)
     if rows is None and jobs is not None:
         raise SceneError(
-            f"{scene}: fits into memory; --jobs is for a scene that is merged in parts"
+            f"{scene}: fits into memory; expected no --jobs, which is for merging in parts"
         )
     if rows is None:
         return _prune_in_memory(scene, options, views, progress)
@@ -97,12 +97,12 @@ def prune(
     done = Report(
         stages=stages, by=options.by, count_before=before, seconds=seconds, written=output
     )
-    return Done(report=done, views=None)
+    return Outcome(report=done, views=None)
 
 
 def _prune_in_memory(
     scene: Source, options: PruneOptions, views: Views | None, progress: bool | Progress
-) -> Done:
+) -> Outcome:
     with progress_bar(progress) as report:
         subject = read_subject(scene, options, views, options.photos, False, report)
     provider = subject.views()
@@ -123,7 +123,7 @@ def _prune_in_memory(
         search=pruned.search,
         dense=subject.dense,
     )
-    return Done(report=_with_held_out(done, subject, (small,)), views=provider)
+    return Outcome(report=_with_held_out(done, subject, (small,)), views=provider)
 
 
 @normal_mode
@@ -135,15 +135,15 @@ def compact(
     views: Views | None = None,
     state_file: Path | None = None,
     progress: bool | Progress = False,
-) -> Done:
+) -> Outcome:
     """Read a scene and compact it.
 
     Args:
         scene: N Gaussians, or the path of a scene.
-        options: what to keep, how to repair it, and where to look from.
-        refiner: the network of ``options.refiner``.
+        options: budget, method, repair and views.
+        refiner: trained network of ``options.refiner``.
         views: known views, in place of ``options.poses``.
-        state_file: file of the state of a long repair, from which it continues.
+        state_file: file with the state of a long repair, from which a killed command continues.
         progress: as for :func:`prune`.
 
     Raises:
@@ -166,11 +166,11 @@ def compact(
     places = [place for place, stage in enumerate(done.stages) if stage.photos is not None]
     before_photos = done.stages[: places[0]] if places else done.stages
     results = (last_accepted(before_photos).scene, done.scene)
-    return Done(report=_with_held_out(done, subject, results), views=provider)
+    return Outcome(report=_with_held_out(done, subject, results), views=provider)
 
 
 def _with_held_out(done: Report, subject: Subject, results: tuple[Gaussians, ...]) -> Report:
-    """The report with the PSNR of results in held-out photos, if there are any."""
+    """The report with the PSNR of ``results`` in held-out photos, if there are any."""
     dense = subject.dense.to(default_device())
     return replace(
         done,

@@ -1,8 +1,8 @@
-"""How the photos and poses of a trained run are found.
+"""Finds the photos and poses of a trained run.
 
-The package itself does not read datasets of runs. An installed plugin does, and registers itself as
-an entry point of the group ``pointsplat_ns.run_data``; the nerfstudio plugin is one. It is loaded
-when a run's data is first asked for.
+The package itself does not read the datasets of runs. A plugin does, such as the nerfstudio plugin.
+It registers itself as an entry point of the group ``pointsplat_ns.run_data``, and is loaded on
+first use.
 """
 
 from __future__ import annotations
@@ -25,20 +25,19 @@ Split = Literal["train", "test"]
 
 
 class RunData(Protocol):
-    """Reads the dataset of a run: its folder, ``config.yml`` or checkpoint. ``data`` says where the
-    dataset is now, if it moved: the dataset itself, or a folder above it."""
+    """Reads the dataset of a run, given by its folder, ``config.yml`` or checkpoint. ``data`` is
+    the new place of a dataset that has moved: the dataset itself, or a folder above it."""
 
     def views(self, run: Path | str, split: Split, data: Path | str | None) -> Views:
         """The poses of a split, in the frame of the trained scene, on the CPU. Raises SceneError if
         there is no run, DataError if its poses are not usable."""
 
     def photos(self, run: Path | str, split: Split, data: Path | str | None) -> Photos:
-        """The photos of a split, read when they are asked for. Errors are those of
-        :meth:`views`."""
+        """The photos of a split, read lazily. Raises the errors of :meth:`views`."""
 
     def check_named(self, run: object, data: Path | str) -> None:
-        """Raise a PointSplatError if ``run`` is no path of a run, its poses cannot be read from
-        ``data``, or renders of its scene are not like the photos there."""
+        """Raise a PointSplatError if ``run`` is not the path of a run, its poses cannot be read
+        from ``data``, or renders of its scene do not match the photos there."""
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """The stages of compaction after pruning: refinement, repair, training on photos, rounding.
 
-A stage takes the result of the last stage that was accepted and a :class:`Context`, and returns its
-own result: the scene, its errors before and after, and why it is left out, if it is.
+A stage takes the result of the last accepted stage and a :class:`Context`. It returns its own
+result: the scene, errors before and after, and the reason to reject it, if any.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pointsplat_ns.system.progress import Progress, silent
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What stages know beside the scene that they change."""
+    """Inputs common to all stages."""
 
     dense: Gaussians
     """The dense scene, on the device that renders."""
@@ -37,7 +37,7 @@ class Context:
     comparison: Comparison | None
     """Compares scenes with the dense scene; None if there are no views."""
     uncompared: str = ""
-    """The error for which there is no comparison."""
+    """Error that prevents the comparison."""
     progress: Progress = silent
 
     @property
@@ -47,10 +47,11 @@ class Context:
 
 
 class Stage(Protocol):
-    """A change to a scene that may be left out."""
+    """A change to a scene, which is accepted or rejected."""
 
     def run(self, last: StageResult, context: Context) -> StageResult:
-        """Change the scene of the last accepted stage, and say whether the change is accepted."""
+        """Change the scene of the last accepted stage, and decide whether the change is
+        accepted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,20 +60,22 @@ class Refine:
 
     refiner: TrainedRefiner
     share: float
-    """Share of the dense scene's Gaussians that the pruned scene holds."""
+    """Number of Gaussians after pruning, as a share of the dense scene's."""
 
     def run(self, last: StageResult, context: Context) -> StageResult:
         context.progress("refining", 0.0)
         refined = self.refiner(last.scene, self.share)
-        unsound = int((last.scene.usable() & ~refined.usable()).sum())
-        if unsound:
-            reason = Reason(Cause.NOT_FINITE, count=unsound, total=len(refined))
+        not_finite = int((last.scene.usable() & ~refined.usable()).sum())
+        if not_finite:
+            reason = Reason(Cause.NOT_FINITE, count=not_finite, total=len(refined))
             return StageResult("refine", refined, None, before=last.after, reason=reason)
         if context.comparison is None or last.after is None:
             reason = Reason(Cause.NOT_COMPARED, error=context.uncompared)
             return StageResult("refine", refined, None, reason=reason)
-        after, why = context.comparison.judged(last.after, last.scene, refined, context.progress)
-        return StageResult("refine", refined, after, before=last.after, reason=why)
+        after, rejection = context.comparison.judge(
+            last.after, last.scene, refined, context.progress
+        )
+        return StageResult("refine", refined, after, before=last.after, reason=rejection)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +84,11 @@ class Repair:
 
     budget: RepairBudget
     state_file: Path | None = None
-    """File of the state of a long repair, from which it continues; None for none."""
+    """File with the state of a long repair, from which a killed command continues; None for
+    none."""
 
     def applies(self, last: StageResult) -> bool:
-        """Whether there is something to repair that can be compared, and time for it."""
+        """Whether the scene can be compared, has errors, and the budget is not empty."""
         return last.after is not None and last.after.psnr < math.inf and not self.budget.empty
 
     def run(self, last: StageResult, context: Context) -> StageResult:
@@ -99,13 +103,13 @@ class Repair:
             psnr=last.after.psnr,
             unfinished=self.state_file,
         )
-        after, why = context.comparison.judged(last.after, last.scene, repaired.scene)
+        after, reason = context.comparison.judge(last.after, last.scene, repaired.scene)
         return StageResult(
             stage="repair",
             scene=repaired.scene.to(last.scene.device),
             after=after,
             before=last.after,
-            reason=why,
+            reason=reason,
             steps=repaired.steps,
             seconds=repaired.seconds,
             interrupted=repaired.interrupted,
@@ -114,7 +118,7 @@ class Repair:
 
 @dataclass(frozen=True, eq=False)
 class TrainOnPhotos:
-    """Training on photos, accepted by photos."""
+    """Training on photos, accepted by its PSNR in photos."""
 
     photos: Photos
     budget: PhotoBudget
@@ -136,11 +140,11 @@ class TrainOnPhotos:
         )
         return self._judged(last, trained, context)
 
-    def beside(self, result: StageResult, repaired: StageResult, context: Context) -> StageResult:
-        """The result of a training, compared with a repair in place of the scene before it."""
+    def against(self, result: StageResult, repaired: StageResult, context: Context) -> StageResult:
+        """The result of a training, compared with a repair instead of the scene before training."""
         assert result.photos is not None
         scene = repaired.scene.to(context.dense.device)
-        return self._judged(repaired, result.photos.beside(scene, self.photos), context)
+        return self._judged(repaired, result.photos.against(scene, self.photos), context)
 
     def _judged(self, last: StageResult, trained: PhotoRepaired, context: Context) -> StageResult:
         most_lost = PHOTO_REPAIR.most_lost if last.stage == "repair" else 0.0
@@ -159,8 +163,8 @@ class TrainOnPhotos:
 
 
 def rounded(last: StageResult, limit: FileLimit, reference: DenseReference | None) -> StageResult:
-    """The scene of the last accepted stage, rounded for a compressed file; ``last`` if it stays as
-    it is."""
+    """Round the scene of the last accepted stage for a compressed file. Returns ``last`` if nothing
+    is rounded."""
     scene = limit.rounded(last.scene)
     if scene is last.scene:
         return last

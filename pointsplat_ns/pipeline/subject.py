@@ -9,7 +9,7 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.pipeline.options import NO_POSES, ViewOptions
 from pointsplat_ns.pipeline.photos.examples import Photos
 from pointsplat_ns.pipeline.photos.posed_photos import read_with_photos
-from pointsplat_ns.pipeline.photos.posed_scene import check_photos, read_found
+from pointsplat_ns.pipeline.photos.posed_scene import check_photos, read_scene_and_cameras
 from pointsplat_ns.pipeline.run_data import run_data
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.scene.camera_files import is_camera_file
@@ -23,22 +23,22 @@ Source = Gaussians | str | Path
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """The dense scene of a request, and what is known of it."""
+    """The dense scene of a request, with its views and photos."""
 
     dense: Gaussians
     options: ViewOptions
     given: Views | None = None
     """Known views; None if views come from the dataset of ``run``, or are sampled."""
     run: Path | str | None = None
-    """The file or folder whose dataset may have the poses."""
+    """File or folder of the run whose dataset may have the poses."""
     poses: Path | None = None
-    """The file of cameras that the views are of."""
+    """The camera file of the views."""
     training: Photos | None = None
-    """Photos to train on; None if none were asked for."""
+    """Photos to train on; None if not requested."""
     held_out: Photos = ()
-    """Photos that judge."""
+    """Photos to judge by."""
     no_held_out: str = ""
-    """The error for which there are no held-out photos."""
+    """Error for which there are no held-out photos."""
 
     def views(self) -> ViewProvider:
         """A new provider of the views."""
@@ -60,23 +60,23 @@ def read_subject(
     training: bool = True,
     progress: Progress = silent,
 ) -> Subject:
-    """Read the dense scene, its views, and its photos if they are asked for.
+    """Read the dense scene, its views and, on request, its photos.
 
     Args:
         scene: N Gaussians, or the path of a scene.
-        options: where to look from.
+        options: options on views.
         views: known views, in place of ``options.poses``.
-        photos: whether to read the photos of the scene's run; or a folder of photos, whose poses
-            are those of ``options.poses``, or are looked for if that is None.
+        photos: whether to read the photos of the scene's run; or a folder of photos. Its poses come
+            from ``options.poses``, or from a camera file nearby.
         training: whether to read the photos that are not held out.
         progress: called with the name of the current task and the share of it that is done, in [0,
             1].
 
     Raises:
         SceneError: if a file is missing or damaged, the scene is a ``pointsplat`` run, which is
-            pruned already, or the photos of a run are wanted and there is no run.
-        DataError: if a file of cameras is not usable, most of its cameras see nothing of the scene,
-            or photos are not found or unlike the scene.
+            already pruned, or photos of a run are requested and there is no run.
+        DataError: if a camera file is not usable, most of its cameras see nothing of the scene, or
+            photos are missing or do not match the scene.
     """
     if not isinstance(photos, bool):
         named = options.poses if views is None else views
@@ -102,24 +102,24 @@ def read_subject(
     assert not isinstance(scene, Gaussians)
     trained = run_data().photos(scene, "train", options.data)
     check_photos(subject.dense, trained, str(scene))
-    found: Photos = ()
+    held_out: Photos = ()
     missing = ""
     try:
         every = run_data().photos(scene, "test", options.data)
-        found = [every[index] for index in spread_indices(len(every), VIEW_COUNTS.compared)]
+        held_out = [every[index] for index in spread_indices(len(every), VIEW_COUNTS.compared)]
     except DataError as error:
         missing = str(error)
-    return replace(subject, training=trained, held_out=found, no_held_out=missing)
+    return replace(subject, training=trained, held_out=held_out, no_held_out=missing)
 
 
 def _read_with_views(scene: Source, options: ViewOptions, views: Views | None) -> Subject:
-    """The dense scene and its views: given ones, those of a file of cameras, or of a run."""
+    """The dense scene and its views: given, from a camera file, or from a run."""
     named = views if options.poses is None else options.poses
     if options.data is not None:
         run_data().check_named(scene if named is None or options.sampled else named, options.data)
     file = _camera_file(options)
     looked_for = None if named is None else NO_POSES
-    dense, found, place = read_found(scene, looked_for if file is None else file)
+    dense, found, place = read_scene_and_cameras(scene, looked_for if file is None else file)
     run: Path | str | None = None
     if named is None and not isinstance(scene, Gaussians):
         run = scene
@@ -129,13 +129,13 @@ def _read_with_views(scene: Source, options: ViewOptions, views: Views | None) -
 
 
 def _camera_file(options: ViewOptions) -> Path | str | None:
-    """The file of cameras that ``poses`` names; None if it is a run, or there is none. Raises
-    SceneError if it is not there."""
+    """The camera file in ``poses``; None if ``poses`` is a run or not a path. Raises SceneError if
+    the path does not exist."""
     if options.poses is None or options.sampled:
         return None
     if not Path(options.poses).exists():
         raise SceneError(
-            f"{options.poses}: no such file or folder; expected views, a run whose dataset has the "
-            "poses, or a file of cameras"
+            f"{options.poses}: no such file or folder; expected a camera file, or a run whose "
+            "dataset has the poses"
         )
     return options.poses if is_camera_file(Path(options.poses)) else None

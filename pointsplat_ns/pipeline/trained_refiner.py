@@ -1,6 +1,6 @@
 """Loads trained refiners with their pruning settings: the shipped one, a file of weights, or a run.
 
-Reading needs no nerfstudio and does not execute a run's ``config.yml``.
+Reading needs no nerfstudio, and never executes a run's ``config.yml``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class TrainedRefiner:
     settings: PruneSettings
     source: Path
     options: Mapping[str, Any] = field(default_factory=dict)
-    """The options of ``ns-train pointsplat`` that the network was built with, as far as known."""
+    """Options of ``ns-train pointsplat`` that the network was built with, as far as recorded."""
 
     @torch.no_grad()
     def __call__(self, scene: Gaussians, kept: float | None = None) -> Gaussians:
@@ -48,8 +48,8 @@ class TrainedRefiner:
 
         Args:
             scene: K Gaussians.
-            kept: share of the dense scene's Gaussians that these are, in (0, 1]; by default that of
-                the training if it is a share, else a tenth.
+            kept: number of Gaussians as a share of the dense scene's, in (0, 1]; by default the
+                share of the training scenes, or a tenth if their budget is not a share.
 
         Raises:
             SceneError: if the SH degree exceeds the network's.
@@ -73,10 +73,10 @@ def load_refiner(
 
     Args:
         path: a ``.safetensors`` file, or a ``pointsplat`` run (its folder, ``config.yml`` or
-            checkpoint); by default or for "shipped" the one that ships for the method ``by``
-            (the pages in ``pointsplat_ns/refinement/pretrained`` describe their training).
+            checkpoint); by default, or with "shipped", the shipped refiner for the method ``by``
+            (pages in ``pointsplat_ns/refinement/pretrained`` describe the training).
         device: device of the network; by default CUDA if available, else the CPU.
-        by: the pruning method that a shipped refiner is for; by default "merge".
+        by: pruning method of the shipped refiner; by default "merge".
 
     Raises:
         WeightsError: if the file is missing, damaged or of another kind.
@@ -93,8 +93,8 @@ def load_refiner(
     path = shipped_refiner(by or "merge") if path is None or shipped else Path(path)
     if shipped and not path.is_file():
         raise WeightsError(
-            f"{path}: the refiner that ships is not there; install the package again, or name "
-            "another (--refiner RUN_OR_FILE)"
+            f"{path}: the shipped refiner is missing; install the package again, or name another "
+            "(--refiner RUN_OR_FILE)"
         )
     kind = path.suffix.lower()
     options: Mapping[str, Any]
@@ -134,8 +134,8 @@ def refine(
     Args:
         scene: K Gaussians.
         refiner: from :func:`load_refiner`; by default the shipped one.
-        kept: share of the dense scene's Gaussians that these are, in (0, 1], for networks that
-            refine scenes of several budgets; by default that of the training.
+        kept: number of Gaussians as a share of the dense scene's, in (0, 1], for networks that
+            refine scenes of several budgets; by default the share of the training scenes.
 
     Returns:
         K Gaussians on the device of the given scene.
@@ -153,8 +153,9 @@ def refine(
 
 
 def open_refiner_run(path: Path | str, need_data: bool, data: Path | str | None = None) -> Run:
-    """The ``pointsplat`` run at a path; arguments as of :func:`~pointsplat_ns.scene.runs.open_run`.
-    Raises SceneError if there is none, or it is damaged or of another kind."""
+    """The ``pointsplat`` run at a path; arguments as for
+    :func:`~pointsplat_ns.scene.runs.open_run`. Raises SceneError if the run is missing, damaged or
+    of another method."""
     run = open_run(path, need_data, data)
     if not run.is_refiner:
         raise SceneError(
@@ -165,9 +166,9 @@ def open_refiner_run(path: Path | str, need_data: bool, data: Path | str | None 
 
 
 def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
-    """Checkpoints and PLY files of the dense scenes, by name, that a ``pointsplat`` run was trained
-    on, and the name of the scene for viewers and exporters. The run is opened with its data. Raises
-    SceneError if the scenes are no longer there."""
+    """Checkpoints and PLY files of the training scenes of a ``pointsplat`` run, by name, and the
+    name of the scene for viewers and exporters. The run must be opened with its data. Raises
+    SceneError if no scene is found."""
     runs, plys, reason = find_runs_and_plys(
         run.data, run.datamanager_fields.get("supervision", "auto")
     )
@@ -181,8 +182,8 @@ def scenes_of_run(run: Run) -> tuple[dict[str, Path], str]:
 
 def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
     """Pruning settings from a run's model settings or a file's metadata. The opacity weight is
-    ignored for methods that have none. Raises KeyError for a missing setting, and other errors if
-    one is not usable."""
+    ignored for methods without one. Raises KeyError for a missing setting, and other errors for an
+    unusable one."""
     by = saved["by"]
     saved_weight = saved.get("opacity_weight")
     weight = None if saved_weight is None else float(saved_weight)
@@ -192,14 +193,14 @@ def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
 
 
 LATER_OPTIONS = ("enc_depths", "stem", "raw_inputs", "means_reach", "units", "norm")
-"""Network options that runs of earlier versions lack, or that None leaves to the size."""
+"""Network options that earlier versions lack; None takes the value of the size."""
 
 NETWORK_OPTIONS = ("encoder", "use_appearance", "use_position", *LATER_OPTIONS)
-"""Options of ``ns-train pointsplat``, beside the size, that networks are built with."""
+"""Options of ``ns-train pointsplat`` that define a network, in addition to the size."""
 
 
 def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The network options in a run's model settings, as changes to the preset of its size."""
+    """Network options of a run's model settings that override the preset of its size."""
     return {
         **{name: settings[name] for name in ("encoder", "use_appearance", "use_position")},
         **{name: settings[name] for name in LATER_OPTIONS if settings.get(name) is not None},
@@ -207,7 +208,7 @@ def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
-    """The network of a ``pointsplat`` run's checkpoint, and its settings."""
+    """The network in the checkpoint of a ``pointsplat`` run, and its pruning settings."""
     try:
         network = Refiner(preset(run.model_fields["size"], **network_options(run.model_fields)))
         settings = settings_from(run.model_fields)

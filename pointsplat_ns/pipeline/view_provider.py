@@ -27,27 +27,27 @@ from pointsplat_ns.view_sampling.upright import Up
 
 @dataclass(frozen=True)
 class ViewCounts:
-    """Maximum numbers of views for what is decided by views. Datasets may have thousands."""
+    """Maximum numbers of views per purpose. Datasets may have thousands."""
 
     weighed: int = 48
-    """Known views from which merging computes visibility weights."""
+    """Known views for the visibility weights of merging."""
     compared: int = 12
     """Views in which renders are compared."""
     stepped: int = 96
-    """Sampled views for the steps of repairs of few Gaussians."""
+    """Sampled views for the steps of a repair of few Gaussians."""
     scored: int = 40
-    """Views for methods that score by views."""
+    """Views for methods that score in views."""
     opening: int = 24
-    """Known views from which those of a page are chosen."""
+    """Known views from which the views of a page are chosen."""
     walked: int = 12
-    """Views that a walk passes."""
+    """Views along the camera path of a film."""
 
 
 VIEW_COUNTS = ViewCounts()
 
 
 class Origin(Enum):
-    """Where views come from."""
+    """Kind of source of views."""
 
     GIVEN = "given"
     DATASET = "dataset"
@@ -56,28 +56,27 @@ class Origin(Enum):
 
 @dataclass(frozen=True)
 class ViewOrigin:
-    """Where the views of a scene came from."""
+    """Origin of the views of a scene."""
 
     kind: Origin
     up: Up | None = None
-    """The axis that is up, of sampled views."""
+    """Up direction of sampled views."""
     missing: str = ""
-    """Why the dataset of the scene's run gives no poses; empty if it does, or there is no run."""
+    """Error of reading poses from the run's dataset; empty if there was none, or no run."""
 
 
 class ViewProvider:
-    """Views of a scene, looked up or sampled when they are first needed (a budget in Gaussians
-    needs none).
+    """Views of a scene, read or sampled on first use (a budget in Gaussians needs none).
 
     Args:
         scene: the scene that the views are for.
-        given: views to use; ``run`` is then ignored.
-        run: the file or folder that the scene was read from. If it is a run whose data is found,
-            its training poses are used.
-        data: where the run's data is now, if it moved.
-        resolution: width and height, pixels, of the pictures that people look at. By default given
-            views and photos have their own, and sampled views 1920 x 1080.
-        up: which way is up, for sampled views; by default what the scene declares, or estimated.
+        given: known views; they take precedence over ``run``.
+        run: file or folder of the scene. If it belongs to a run whose dataset can be read, views
+            are its training poses.
+        data: folder of the run's data, if it has moved.
+        resolution: width and height at which people view the scene, pixels. By default given views
+            and photos keep their size, and sampled views have 1920 x 1080.
+        up: up direction for sampled views; by default declared by the scene, or estimated.
     """
 
     def __init__(
@@ -96,13 +95,13 @@ class ViewProvider:
         self._resolution = resolution
         self._up = up
         self.origin: ViewOrigin | None = None
-        """Where views came from; None until there are some."""
+        """Origin of the views; None before first use."""
         self.missing = ""
-        """Why a run's dataset gives no poses; empty if it does, or was not looked for."""
+        """Error of reading poses from the run's dataset; empty if there was none."""
 
     @property
     def given(self) -> Views | None:
-        """The views that were given, if any."""
+        """Given views; None if there are none."""
         return self._given if self._given is not None and len(self._given) else None
 
     @cached_property
@@ -121,19 +120,19 @@ class ViewProvider:
 
     @property
     def _known(self) -> Views | None:
-        """All known views."""
+        """All known views; None if there are none."""
         return self._of_dataset if self.given is None else self.given
 
     def known(self, count: int) -> Views | None:
-        """At most ``count`` known views: given ones, or those of the dataset's training poses; None
-        if there are none."""
+        """At most ``count`` known views: given views, or the dataset's training poses; None if
+        there are none."""
         if self._known is None:
             return None
         self.origin = ViewOrigin(Origin.DATASET if self.given is None else Origin.GIVEN)
         return self._at_resolution(self._known.spread(count))
 
     def views(self, count: int) -> Views:
-        """At most ``count`` known views, or sampled ones.
+        """At most ``count`` known views, or as many sampled ones.
 
         Raises:
             DataError: if the given views are empty, or none can be sampled.
@@ -152,16 +151,15 @@ class ViewProvider:
         return Sampler(self._scene, self._resolution or RESOLUTION, self._up)
 
     def for_merging(self) -> Views | Sampler:
-        """At most :data:`VIEW_COUNTS.weighed` known views; the sampler if there are none."""
+        """At most ``VIEW_COUNTS.weighed`` known views; the sampler if there are none."""
         return self.known(VIEW_COUNTS.weighed) or self.sampler
 
     def _at_resolution(self, views: Views) -> Views:
-        """Views with the longer side of the resolution, if one was asked for."""
+        """Views resized to the longer side of the requested resolution, if any."""
         return views if self._resolution is None else views.resized(max(self._resolution))
 
     def whole(self) -> Views:
-        """The views in which renders are compared, at their full size: at most
-        ``VIEW_COUNTS.compared``."""
+        """At most ``VIEW_COUNTS.compared`` views in which renders are compared, at full size."""
         return self._whole
 
     @cached_property
@@ -174,31 +172,33 @@ class ViewProvider:
         return middle_sized(self._whole)
 
     def scored(self, count: int) -> Views:
-        """At most ``count`` views for scores, of the size of :meth:`compared`."""
+        """At most ``count`` views for scores, at the size of :meth:`compared`."""
         return middle_sized(self.views(count))
 
     def others(
         self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = SMALLEST_SIDE
     ) -> Iterator[View]:
-        """Views to optimise on, without end: none of the :meth:`compared` ones, in random order,
-        each once before any is repeated. Each is subsampled from a picture of one of
-        :func:`~pointsplat_ns.rendering.comparison.sizes.several_sizes`, the next time of another.
+        """Views to optimise on, endless, without those of :meth:`compared`. Every round shuffles
+        them anew. A view is subsampled from a picture of one of
+        :func:`~pointsplat_ns.rendering.comparison.sizes.several_sizes`, in the next round of
+        another size.
 
-        They are known views; if these are fewer than the compared ones, known and sampled ones in
-        turn; if all known ones are compared, or there are none, sampled ones.
+        They are known views if more are left than compared; with fewer, known and sampled views
+        alternate; with none, all are sampled.
 
         Args:
             seed: seed of the order, and of sampled views.
-            count: number of different sampled views.
-            drawn_side: longer side of what is drawn of a picture, pixels.
+            count: number of distinct sampled views.
+            drawn_side: longer side of the subsampled picture, pixels.
 
         Raises:
-            DataError: if none can be sampled.
+            DataError: if no view can be sampled.
         """
         known = self._known
         compared = self.compared()
-        every = 0 if known is None else len(known)
-        left = sorted(set(range(every)) - set(spread_indices(every, VIEW_COUNTS.compared)))
+        known_count = 0 if known is None else len(known)
+        taken = spread_indices(known_count, VIEW_COUNTS.compared)
+        left = sorted(set(range(known_count)) - set(taken))
         if known is None or not left:
             yield from self.sampled(seed, count, drawn_side)
             return
@@ -206,15 +206,14 @@ class ViewProvider:
         if len(left) > len(compared):
             yield from others
         else:
-            for pair in zip(
-                others, self.sampled(seed, count, drawn_side), strict=False
-            ):  # neither ends
+            sampled = self.sampled(seed, count, drawn_side)
+            for pair in zip(others, sampled, strict=False):  # both are endless
                 yield from pair
 
     def sampled(
         self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = SMALLEST_SIDE
     ) -> Iterator[View]:
-        """Sampled views without end, in the order and of the sizes of :meth:`others`, which has the
+        """Sampled views, endless, ordered and sized as in :meth:`others`, which documents the
         arguments."""
         compared = self.compared()
         views = self.sampler.views(count, seed + 1)
@@ -227,8 +226,8 @@ class ViewProvider:
 
 
 def _shuffled(views: Views, seed: int, drawn_side: int) -> Iterator[View]:
-    """Views in random order, each once before any is repeated, then of another size; without end. A
-    view that comes again is the same object."""
+    """Views in random order, endless. Every round shuffles them anew and changes their sizes. A
+    repeated view of the same size is the same object."""
     sizes = [[*of_size] for of_size in several_sizes(views, drawn_side)]
     generator = random.Random(seed)
     for lap in counted():

@@ -47,18 +47,19 @@ class RefinerConfig:
     """``dual`` gates geometry by appearance (paper eq. 4 to 6); ``concat`` is one concatenated
     vector (SplatFormer)."""
     use_appearance: bool = True
+    """Gate the geometry branch by the appearance branch (Table 4, column f^(a)); dual encoder
+    only."""
     use_position: bool = True
-    """Gate the geometry by the appearance branch, and add the position encoding to both branches
-    (Table 4, columns f^(a) and delta); dual encoder only."""
+    """Add the position encoding to both branches (Table 4, column delta); dual encoder only."""
     feature_dim: int = 32
     """Channels of each encoder branch."""
     unit_gate: bool = False
     """Multiply the softmax gate by its number of channels, so that gates average 1: training is
     faster."""
     color_hidden: int = 32
+    """Hidden channels of the MLP that reduces the SH coefficients of degree 1 and higher."""
     color_dim: int = 8
-    """Hidden and output channels of the MLP that reduces the SH coefficients of degree 1 and
-    higher."""
+    """Output channels of that MLP."""
     raw_inputs: bool = False
     """Give the encoder log-scales in units of the cube and opacity logits as they are, not brought
     to order 1."""
@@ -72,13 +73,17 @@ class RefinerConfig:
     """Growth of the cells from stage to stage, powers of two; 1 only merges points that share a
     cell."""
     enc_channels: tuple[int, ...] = (64, 96, 128, 256, 512)
+    """Channels of the encoder stages."""
     enc_depths: tuple[int, ...] = (2, 2, 2, 4, 2)
+    """Blocks of the encoder stages."""
     enc_heads: tuple[int, ...] = (2, 4, 8, 16, 32)
-    """Channels, blocks and attention heads of each encoder stage."""
+    """Attention heads of the encoder stages."""
     dec_channels: tuple[int, ...] = (96, 96, 128, 256)
+    """Channels of the decoder stages."""
     dec_depths: tuple[int, ...] = (2, 2, 2, 2)
+    """Blocks of the decoder stages."""
     dec_heads: tuple[int, ...] = (4, 4, 4, 4)
-    """Channels, blocks and attention heads of each decoder stage."""
+    """Attention heads of the decoder stages."""
     patch: int = 1024
     """Number of points in an attention patch."""
     mlp_ratio: int = 4
@@ -93,14 +98,15 @@ class RefinerConfig:
     """Normalisation outside the attention blocks, by each channel's mean and variance over the
     points of the current scene. In evaluation the published ``batch`` uses running averages over
     scenes, which fit no single scene. ``layer`` normalises each point by itself, so that its result
-    does not depend on what else the scene holds."""
+    does not depend on the rest of the scene."""
     units: Literal["scene", "local"] = "scene"
     """Unit of positions, sizes and their residuals: the scene's extent (published), or ``local``,
-    the distance to the nearest neighbours, for which the encoder is given statistics of these and
-    the share of the Gaussians that was kept."""
+    the distance to the nearest neighbours. The encoder then gets statistics of these distances and
+    the share of the dense scene's Gaussians that remains."""
     head_width: int = 128
+    """Hidden width of the output heads."""
     head_depth: int = 4
-    """Hidden width and number of linear layers of each output head."""
+    """Number of linear layers of the output heads."""
     means_reach: float = 0.05
     """Largest move of a mean along an axis, as a share of the scene's extent (1.0 in the published
     code), or in local units."""

@@ -1,1 +1,1 @@
-"""Tools around the mission: levels, pages, films, folders, the trade-off."""
+"""Tools on top of the pipeline: levels of detail, pages, films, folders, the tradeoff."""

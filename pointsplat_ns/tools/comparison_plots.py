@@ -1,4 +1,4 @@
-"""Images of scenes side by side, and distributions of opacity and size."""
+"""Draws scenes side by side."""
 
 from __future__ import annotations
 
@@ -31,19 +31,17 @@ def plot_comparison(
     files: Sequence[str] = ("", ""),
     quality: Quality | None = None,
 ) -> str:
-    """Draw three of the compared views: the dense scene, and the scene after each stage, side by
-    side.
+    """Draw the dense scene and the scene after each stage side by side, in three views.
 
     Args:
         dense: the scene that was compacted.
         result: the result of :func:`pointsplat_ns.compact`.
         path: the PNG file to write.
-        files: text on the files of the dense scene and of the result, such as "room.ply, 7.42 MB",
-            for their titles.
-        quality: of the result's file, for its title.
+        files: titles of the dense scene and the result, such as "room.ply, 7.42 MB".
+        quality: quality of the result's file, for its title.
 
     Returns:
-        A line of text: the columns of the image, or the reason for none.
+        A line of text: the columns of the image, or the reason why nothing is drawn.
 
     Raises:
         SceneError: if the file cannot be written.
@@ -62,23 +60,21 @@ def plot_comparison(
         return f"{path}: not drawn, because there are no views"
     views = result.reference.views
     renders = result.reference.renders
-    rows_of = spread_indices(len(views), 3)
+    shown = spread_indices(len(views), 3)
     names = ["dense"]
     titles = [_title("dense", dense, files[0])]
     scenes = []
     for stage in result.stages:
         if stage.after is not None:
             done = STAGES[stage.stage]
-            names.append(done if stage.accepted else f"{done} (left out)")
+            names.append(done if stage.accepted else f"{done} (rejected)")
             last = stage is result.last
             lines: tuple[str, ...] = ()
             if last:
                 lines = (files[1], *(() if quality is None else quality_lines(quality)))
             titles.append(_title(names[-1], stage.scene, *lines))
             scenes.append(stage.scene)
-    rows = [
-        [renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in rows_of
-    ]
+    rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in shown]
     side_by_side(rows, titles, path)
     return f"{path}: {', '.join(names)}, side by side"
 
@@ -89,7 +85,7 @@ def _title(name: str, scene: Gaussians, *lines: str) -> str:
 
 @torch.no_grad()
 def plot_views(dense: Gaussians, source: ViewProvider, path: Path | str) -> str:
-    """Draw up to 16 of the views that decide about a scene, as a sheet of four columns.
+    """Draw up to 16 of the views used for decisions on a scene, as a sheet of four columns.
 
     Args:
         dense: N Gaussians on the CPU.
@@ -97,7 +93,7 @@ def plot_views(dense: Gaussians, source: ViewProvider, path: Path | str) -> str:
         path: the PNG file to write.
 
     Returns:
-        A line of text: how many views there are, and their origin.
+        A line of text: number, size and origin of the views.
 
     Raises:
         DataError: if there are no views.
@@ -117,39 +113,41 @@ def plot_views(dense: Gaussians, source: ViewProvider, path: Path | str) -> str:
 
 @torch.no_grad()
 def plot_cleaning(done: Cleaned, path: Path | str) -> None:
-    """Draw the three of some views in which most pixels go: the dense scene; what goes, before the
-    scene in grey, the ten largest clusters in colours of their own; and the cleaned scene."""
+    """Draw the three views with the most removed pixels: the dense scene; the removed Gaussians
+    over the scene in grey, with a colour per cluster for the ten largest; and the cleaned scene."""
     from matplotlib import colormaps
 
     dense = done.dense
     cleaned = done.scene
     views = done.views.scored(VIEW_COUNTS.scored)
-    gone = dense[done.cleaning.junk.first(len(dense) - 1).indices.to(dense.device)]
-    gone = gone[gone.usable()]
-    colors = torch.from_numpy(colormaps["tab10"](np.arange(10))[:, :3])[clusters(gone).clamp_max(9)]
-    marked = gone.replace(
-        features_dc=((colors - 0.5) / SH_C0).to(gone.means),
-        features_rest=torch.zeros_like(gone.features_rest),
+    removed = dense[done.cleaning.junk.first(len(dense) - 1).indices.to(dense.device)]
+    removed = removed[removed.usable()]
+    colors = torch.from_numpy(colormaps["tab10"](np.arange(10))[:, :3])[
+        clusters(removed).clamp_max(9)
+    ]
+    marked = removed.replace(
+        features_dc=((colors - 0.5) / SH_C0).to(removed.means),
+        features_rest=torch.zeros_like(removed.features_rest),
     )
     views = dataclasses.replace(views, background=torch.zeros_like(views.background))
     shares = torch.stack([render_with_alpha(marked, view)[1].sum() for view in views])
     rows = []
     for view in views[shares.argsort(descending=True, stable=True)[:3].cpu()]:
         before = render(dense, view)
-        (over, alpha) = render_with_alpha(marked, view)
+        over, alpha = render_with_alpha(marked, view)
         grey = 0.2 + 0.5 * before.mean(-1, keepdim=True).expand_as(before)
         rows.append([before.cpu(), (over + (1 - alpha) * grey).cpu(), render(cleaned, view).cpu()])
     titles = [
         f"{len(dense):,} Gaussians",
-        f"{len(dense) - len(cleaned):,} go",
-        f"{len(cleaned):,} stay",
+        f"{len(dense) - len(cleaned):,} removed",
+        f"{len(cleaned):,} remain",
     ]
     side_by_side(rows, titles, path)
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:
-    """Draw a grid of images (H, W, 3) in [0, 1] of one size to a PNG file, with a title above each
-    column, also in the file's description. Raises SceneError if the file cannot be written."""
+    """Draw a grid of images (H, W, 3) of one size, in [0, 1], to a PNG file. Titles stand above the
+    columns and in the file's description. Raises SceneError if the file cannot be written."""
     from matplotlib.figure import Figure
 
     height, width = np.shape(rows[0][0])[:2]

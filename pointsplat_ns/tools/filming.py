@@ -1,4 +1,4 @@
-"""The public functions to view scenes: films along camera paths, and a viewer in the browser."""
+"""Public functions to view scenes: films along camera paths, and a viewer in the browser."""
 
 from __future__ import annotations
 
@@ -45,29 +45,28 @@ def render_path(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> int:
-    """Film a scene, or two scenes side by side with the same cameras.
+    """Film a scene, or two scenes side by side from the same cameras.
 
-    The film goes exactly through the views or the poses of the run's dataset; without these around
-    an object, or past what shows most of a room.
+    The camera path passes exactly through the views, or through the poses of the run's dataset.
+    Without known views, it circles an object, or walks past the views that show most of a room.
 
     Args:
         scene: N Gaussians, or the path of a scene.
-        output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame
-            alone. It appears when it is complete.
+        output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for only the first
+            frame. It appears only when complete.
         other: a second scene in the same frame, to compare with. Both are labelled with their names
             and counts.
-        views: views to go through, in place of the dataset's poses: views, or a file of cameras
+        views: views along the path, in place of the dataset's poses: views, or a camera file
             (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP
             model).
-        up: the axis that is up in the scene ("z", "-y") for a film without views; by default the
-            scene's own, or estimated.
-        data: folder of the run's photos and poses, or one above it, if it is no longer where the
-            run says.
+        up: up axis of the scene ("z", "-y") for a film without views; by default declared by the
+            scene, or estimated.
+        data: folder of the run's photos and poses, or a folder above it, if the data has moved.
         width: width of one scene's picture, pixels; by default that of the photos, at most 960.
-        height: its height, pixels.
-        fps: frames a second.
-        seconds: length; by default 10, or long enough for every pose of a dataset. A folder gets
-            one frame for each of ``views`` by default.
+        height: height of one scene's picture, pixels.
+        fps: frames per second.
+        seconds: length of the film; by default 10, or enough for every pose of a dataset. A folder
+            of frames has one frame per view of ``views`` by default.
         force: overwrite existing files.
         progress: True shows a bar with the time left; a function is called with the share done.
 
@@ -76,8 +75,9 @@ def render_path(
 
     Raises:
         SceneError: if a scene is not usable, or the output cannot be written.
-        DataError: if nothing of the scene is visible, or most views of a file see nothing of it.
-        PointSplatError: if a size, speed or length is not valid.
+        DataError: if nothing of the scene is visible, or most views of a camera file see nothing of
+            it.
+        PointSplatError: if a size, speed or length is invalid.
 
     Example:
         >>> import tempfile
@@ -95,7 +95,7 @@ def render_path(
     subject = read_subject(scene, options, given)
     dense = subject.dense
     source = subject.views()
-    if source.given is not None and given is None:  # from a file, as large as its photos
+    if source.given is not None and given is None:  # from a camera file, at the size of its photos
         source = ViewProvider(dense, source.given.resized(PHOTO_SIDE))
     sources = [scene]
     loaded = [dense]
@@ -106,8 +106,8 @@ def render_path(
         settings = replace(settings, seconds=len(source.given) / fps)
     cameras, origin = camera_path(dense, source, settings, kind == "picture", options.upward)
     names = [
-        f"{_name(s, i)}, {len(g):,} Gaussians"
-        for i, (s, g) in enumerate(zip(sources, loaded, strict=True))
+        f"{_name(shown, index)}, {len(gaussians):,} Gaussians"
+        for index, (shown, gaussians) in enumerate(zip(sources, loaded, strict=True))
     ]
     logger.info("%d x %d pixels: %s", cameras.width, cameras.height, origin)
     frames = render_frames(loaded, cameras, names if len(loaded) > 1 else ())
@@ -126,25 +126,24 @@ def open_viewer(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> Viewer:
-    """Show a scene, or two scenes with the same camera, in a browser with WebGL 2, which draws.
+    """Show a scene, or two scenes with the same camera, in a browser, which renders with WebGL 2.
 
-    It opens upright, at the known or sampled view that shows most of the scene, or at the whole of
-    an object.
+    The page opens upright, at the known or sampled view that shows most of the scene, or at a view
+    of a whole object.
 
     Args:
-        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped
-            on it.
-        other: a second scene in the same frame, to compare with; by default the first is compared
-            with all of itself.
+        scene: N Gaussians, or the path of a scene; by default the page opens a dropped file.
+        other: a second scene in the same frame, to compare with; by default all Gaussians of the
+            first.
         views: known views of the first scene, as for :func:`render_path`.
-        up: the axis that is up in the scene ("z", "-y"); by default the scene's own, or estimated.
+        up: up axis of the scene ("z", "-y"); by default declared by the scene, or estimated.
         data: folder of the data of ``scene``, as for :func:`render_path`.
-        host: the address to listen on; by default only this machine has access. With another
-            address, every machine that reaches it has access.
-        port: the first port to try; 0 takes any free port.
+        host: address to listen on; by default only this machine has access. With another address,
+            every machine in reach has access.
+        port: first port to try; 0 takes any free port.
 
     Returns:
-        The viewer, to be closed, or used in a ``with`` block; ``url`` is its address.
+        The viewer, to close after use, or to use in a ``with`` block; ``url`` is its address.
 
     Raises:
         SceneError: if a scene is not usable.
@@ -167,12 +166,12 @@ def open_viewer(
         return ViewedScene(name, None, subject.dense, subject.views())
 
     scenes: list[ViewedScene] = []
-    for index, shown in enumerate(one for one in (scene, other) if one is not None):
+    for index, shown in enumerate(item for item in (scene, other) if item is not None):
         path = None if isinstance(shown, Gaussians) else Path(shown)
         if scenes:
             loaded = _loaded(shown).at_offset(scenes[0].scene.offset)
             source = ViewProvider(loaded, run=path)
-        else:  # ``upward`` is the page's, not merging's
+        else:  # ``upward`` is for the page, not for merging
             given = views if isinstance(views, Views) else None
             named = None if isinstance(views, Views) else views
             subject = read_subject(shown, ViewOptions(poses=named, data=data), given)

@@ -1,7 +1,7 @@
 """Compacts every scene of a folder, and writes a table of the results.
 
-The record of a result ``room.ply`` is ``room.ply.json``. A result is finished if its record has the
-hash of the input file with the options, and that of the result itself.
+``room.ply.json`` is the record of the result ``room.ply``. A result is finished if its record
+matches two hashes: of the input file with the options, and of the result itself.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ from pointsplat_ns.tools.pages.gallery import draw_pair, pair_of, write_gallery,
 from pointsplat_ns.tools.wording import quality_line
 
 FIGURES = ("before", "after", "megabytes_before", "megabytes", "psnr", "seconds")
-"""Numbers of a result in its record."""
+"""Numeric fields of a record."""
 
 
 @dataclass(frozen=True)
 class SceneResult:
-    """The result of one of many scenes.
+    """The result of one scene of a folder.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -77,36 +77,34 @@ class SceneResult:
     """
 
     name: str
-    """Path below the folder, without a suffix."""
+    """Path relative to the folder, without suffix."""
     source: str
     """Path of the file or run."""
     output: str
     """Path of the result."""
-    status: Literal[
-        "done", "done before", "failed", "open"
-    ]  # ``done before``: by an earlier call; ``open``: not yet
+    status: Literal["done", "done before", "failed", "open"]
+    """``done before``: finished by an earlier call; ``open``: not finished."""
     before: int | None = None
-    """Gaussians of the scene."""
+    """Number of Gaussians of the scene."""
     after: int | None = None
-    """Gaussians of the result."""
+    """Number of Gaussians of the result."""
     megabytes_before: float | None = None
     """Size of the scene's file, 10^6 bytes."""
     megabytes: float | None = None
     """Size of the result, 10^6 bytes."""
     psnr: float | None = None
-    """PSNR against the scene's own renders, dB; None if nothing was compared or they are equal."""
+    """PSNR against renders of the scene, dB; None if not compared, or equal."""
     seconds: float | None = None
     """Duration."""
     error: str = ""
-    """The error in one line; empty if there was none."""
+    """Error in one line; empty if there was none."""
     note: str = ""
-    """A remark on the result; empty if there is none."""
+    """Note on the result; empty if there is none."""
 
     def __str__(self) -> str:
-        """What users read of a result."""
-        return "; ".join(
-            filter(None, ("" if self.psnr is None else quality_line(self.psnr, None), self.note))
-        )
+        """Text on the quality of the result, for users."""
+        quality = "" if self.psnr is None else quality_line(self.psnr, None)
+        return "; ".join(filter(None, (quality, self.note)))
 
 
 @normal_mode
@@ -133,44 +131,40 @@ def compact_folder(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
-    """Compact every scene of a folder by :func:`compact`, and write the results to another folder.
+    """Compact every scene of a folder, as :func:`compact`, and write the results to another folder.
 
-    Unchanged results of the same scene and options are kept, so another call continues an
+    Unchanged results of the same scenes and options are skipped, so a second call continues an
     interrupted one.
 
     Args:
-        folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each
-            experiment.
-        output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the
-            table ``scenes.csv``; by default beside ``folder``: ``scenes_compact`` for ``scenes``.
-            Each result has the format of its scene's file, or is a PLY where that cannot be
-            written.
-        keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format.
+        folder: folder of scenes: all files with Gaussians below it, and the newest Splatfacto run
+            of each experiment.
+        output: folder for the results ``NAME.ply``, their records ``NAME.ply.json``, and the table
+            ``scenes.csv``; by default ``scenes_compact`` beside ``scenes``. Results have the format
+            of their scene's file, or PLY if that format cannot be written.
+        keep: as for :func:`compact`; a size such as "5MB" is the size of each result in its format.
         refiner: as for :func:`~pointsplat_ns.load_refiner`; None for no refiner.
         by, opacity_weight, sh, clean, effort, seconds, target_db, resolution: as for
             :func:`compact`, for each scene.
-        data: folder above the data of the runs. A run whose data is not found gets sampled views,
-            and a note.
-        target_format: suffix of all results, such as ".sog"; by default each result has the format
-            of its scene.
-        html: an .html file for a gallery of all scenes before and after, with links to their files;
+        data: folder above the data of the runs. A run without data gets sampled views and a note.
+        target_format: suffix of all results, such as ".sog"; by default the format of each scene.
+        html: .html file for a gallery of all scenes before and after, with links to their files;
             written at the end.
-        picture: a .png file for the same pictures.
-        jobs: number of processes, which share the cores. With more than one, the program must be a
-            file whose main code is under ``if __name__ == "__main__":``, as for any Python program
+        picture: .png file for the same pictures.
+        jobs: number of processes, which share the cores. With more than one, the main code of the
+            calling program must be under ``if __name__ == "__main__":``, as in any Python program
             that starts processes.
-        force: overwrite files of other origin, changed files, and results with other options.
+        force: overwrite foreign files, changed files, and results of other options.
         progress: True shows a bar; a function is called with the name of the current task and its
             share done.
 
     Returns:
-        The result of each scene, sorted by name. One that fails has the status "failed" and does
-        not stop the others.
+        The results, sorted by name. A failed scene has the status "failed" and does not stop the
+        others.
 
     Raises:
-        PointSplatError: if an option is not valid.
-        SceneError: if there is no scene, or the output folder, page or picture is one of other
-            results.
+        PointSplatError: if an option is invalid.
+        SceneError: if there is no scene, or the output folder, page or picture holds other results.
 
     Example:
         >>> import tempfile
@@ -218,7 +212,7 @@ def compact_folder(
             need_new(shown, force or (target / FOLDER_FILES.scenes).exists())
     if os.path.realpath(folder) == os.path.realpath(target):
         raise SceneError(
-            f"{target}: holds the scenes themselves; name another folder for the results"
+            f"{target}: contains the scenes themselves; name another folder for the results"
         )
     tasks = [
         _Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
@@ -240,7 +234,7 @@ def compact_folder(
                     logger.warning("%s failed: %s", result.name, result.error)
     finally:  # also after an interruption
         for task in tasks:
-            if task.name not in results:  # its process may have ended while it wrote
+            if task.name not in results:  # its process may have died while writing
                 for part in task.output.parent.glob(f".{glob.escape(task.output.name)}*.part"):
                     part.unlink(missing_ok=True)
         rows = [results.get(task.name) or _known(task, _read_record(task)) for task in tasks]
@@ -263,7 +257,7 @@ _loaded = functools.cache(load_refiner)  # once in each process
 
 @dataclass(frozen=True)
 class _Task:
-    """A scene to work on, and the file to write."""
+    """A scene to compact, and the file to write."""
 
     name: str
     source: Path
@@ -281,13 +275,13 @@ class _Task:
 
     @property
     def record(self) -> Path:
-        """The file with the figures and hashes of the result."""
+        """File with the figures and hashes of the result."""
         return self.output.with_name(f"{self.output.name}.json")
 
 
 def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
-    """Write the options beside the results. Raises SceneError if the output is no folder, or holds
-    results of other options."""
+    """Write the options beside the results. Raises SceneError if the output is not a folder, or
+    contains results of other options."""
     need_folder(output)
     path = output / FOLDER_FILES.scenes
     text = json_text(options) + "\n"
@@ -299,7 +293,7 @@ def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
         ) from error
     if other and not force:
         raise SceneError(
-            f"{output}: holds results of other options, see {path.name}; name another folder, or "
+            f"{output}: contains results of other options, see {path.name}; name another folder, or "
             "overwrite them with --force"
         )
     write_json(options, path)
@@ -307,21 +301,20 @@ def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
 
 @dataclass(frozen=True)
 class _Compacting:
-    """Compacts a scene of a folder, unless that is done. It is pickled for other processes."""
+    """Compacts a scene of a folder, unless it is finished. Pickled for other processes."""
 
     options: CompactOptions
     refiner: str | Path | None  # loaded by each process
-    record: Mapping[str, Any]  # what tells results of other options apart
-    drawn: bool  # whether a picture of each scene before and after is wanted
+    record: Mapping[str, Any]  # options as recorded, to recognise results of other options
+    drawn: bool  # whether to draw each scene before and after
     force: bool
 
     def __call__(self, task: _Task) -> SceneResult:
-        """The result of a scene. An error gives one with the status ``failed``, and leaves no
-        file."""
+        """The result of a scene. On an error its status is ``failed``, and no file is left."""
         start = time.perf_counter()
         try:
             for part in source_parts(task.source):
-                require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
+                require_memory(part, part.stat().st_size)  # before hashing a sparse file for hours
             need_no_links(task.folder, task.output)
             source = source_file(task.source)
             text = json.dumps([source.sha256, self.record], sort_keys=True)
@@ -334,8 +327,8 @@ class _Compacting:
             )
             if not whole and os.path.lexists(task.output) and not self.force:
                 raise SceneError(
-                    f"{task.output}: exists already, and was not made by an earlier call or was "
-                    "changed since; name another folder, or overwrite it with --force"
+                    f"{task.output}: exists already, but not as an earlier call wrote it; name another "
+                    "folder, or overwrite it with --force"
                 )
             if record is None or not whole or record["key"] != key:
                 return self._make(task, source.bytes, key, start)
@@ -343,9 +336,8 @@ class _Compacting:
                 self._draw(task, read_scene(task.source), read_scene(task.output))
             return _known(task, record)
         except Exception as error:  # one scene must not stop the others
-            kind = (
-                "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
-            )
+            expected = isinstance(error, (PointSplatError, OSError))
+            kind = "" if expected else f"{type(error).__name__}: "
             return task.result(
                 "failed",
                 seconds=time.perf_counter() - start,
@@ -353,8 +345,8 @@ class _Compacting:
             )
 
     def _make(self, task: _Task, source_bytes: int, key: str, start: float) -> SceneResult:
-        """Write a result and its record. A process killed in between leaves the record alone: the
-        scene is open."""
+        """Write a result and its record. A process killed in between leaves only the record, so the
+        scene counts as open."""
         new = not self.force and not os.path.lexists(task.output)
         dense = read_scene(task.source)
         kind = format_to_write(task.output)
@@ -364,7 +356,7 @@ class _Compacting:
         compact = compact_to_quality if options.searched else compact_scene
         made = compact(dense, options, views, refiner=trained)
         if made.interrupted:
-            raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
+            raise KeyboardInterrupt  # Ctrl-C ends the whole command, not only this scene
         scene = made.scene
         same = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
         same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
@@ -382,9 +374,9 @@ class _Compacting:
                 megabytes=part.stat().st_size / 1e6,
                 psnr=psnr if math.isfinite(psnr) else None,
                 seconds=time.perf_counter() - start,
-                note="kept whole" if same else f"no dataset: {views.missing}" * bool(views.missing),
+                note="unchanged" if same else f"no dataset: {views.missing}" * bool(views.missing),
             )
-            # These must not stand beside the new record.
+            # Old files must not remain beside the new record.
             for old in (pair_of(task.output), *(() if new else (task.output,))):
                 old.unlink(missing_ok=True)
             proofs = {"key": key, "options": self.record, "sha256": content_hash(part)}
@@ -394,7 +386,7 @@ class _Compacting:
         return done
 
     def _draw(self, task: _Task, before: Gaussians, after: Gaussians) -> None:
-        """Draw a scene and its result to a file; nothing if nothing of the scene is visible."""
+        """Draw a scene and its result to a file, unless the scene is invisible."""
         after = after if after.offset is None else after.at_offset(before.offset)
         views = ViewProvider(before, run=task.source, data=self.options.data)
         with suppress(DataError):
@@ -415,7 +407,7 @@ def _read_record(task: _Task) -> dict[str, Any] | None:
 
 
 def _known(task: _Task, record: dict[str, Any] | None) -> SceneResult:
-    """The result in a record; an open one without."""
+    """The result in a record; without a record an open result."""
     if record is None:
         return task.result("open")
     return task.result("done before", **{name: record[name] for name in (*FIGURES, "note")})

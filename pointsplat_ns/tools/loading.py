@@ -21,17 +21,16 @@ def load(path: str | Path, scene: str | None = None, data: str | Path | None = N
     """Read a scene.
 
     Args:
-        path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder,
+        path: a scene file (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder,
             ``.splat``), a checkpoint of Splatfacto or gsplat, a Splatfacto run (its folder or
-            ``config.yml``), or a ``pointsplat`` run, whose dense scene is then pruned and refined
-            as in its training.
+            ``config.yml``), or a ``pointsplat`` run, whose dense scene is pruned and refined as in
+            its training.
         scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else
             the first.
-        data: folder of the scenes of a ``pointsplat`` run, if they are no longer where the run
-            says.
+        data: folder of the scenes of a ``pointsplat`` run, if they have moved.
 
     Returns:
-        The scene, float32 on the CPU. Log-scales and logits are those of the file.
+        The scene, float32 on the CPU, with log-scales and logits as in the file.
 
     Raises:
         SceneError: if the path is none of these, is damaged, or has no such scene.
@@ -46,23 +45,19 @@ def load(path: str | Path, scene: str | None = None, data: str | Path | None = N
     """
     if not _is_refiner_run(path):
         if scene is not None:
-            raise SceneError(f"scene {scene!r}: {path} holds one scene; leave the name out")
+            raise SceneError(f"scene {scene!r}: {path} is a single scene; expected no scene name")
         return read_scene(path)
     scenes, default = scenes_of_run(open_refiner_run(path, need_data=True, data=data))
     chosen = default if scene is None else scene
     if chosen not in scenes:
         raise SceneError(
-            f"scene {chosen!r}: no such scene in {path}; there are {', '.join(scenes)}"
+            f"scene {chosen!r}: no such scene in {path}; expected one of {', '.join(scenes)}"
         )
     refiner = load_refiner(path)
     settings = refiner.settings
     refined = refine(settings.prune(read_scene(scenes[chosen])), refiner)
-    log_lines(
-        (
-            f"{chosen}: pruned by {settings.by} (keep {settings.keep:g}) and refined, as in the "
-            "training",
-        )
-    )
+    pruned = f"pruned by {settings.by} (keep {settings.keep:g})"
+    log_lines((f"{chosen}: {pruned} and refined, as in training",))
     return refined
 
 
@@ -70,4 +65,4 @@ def _is_refiner_run(path: str | Path) -> bool:
     try:
         return may_be_run(path) and open_run(path, need_data=False).is_refiner
     except SceneError:
-        return False  # a single scene, or not readable: read_scene raises the error
+        return False  # a single scene, or unreadable: read_scene raises the error

@@ -1,5 +1,4 @@
-"""Figures of a scene: its file, counts, SH, up, fill, opacities, sizes, bounds and suspicious
-rows."""
+"""Measures a scene: file, counts, SH, up, fill, opacities, sizes, bounds and suspicious rows."""
 
 from __future__ import annotations
 
@@ -37,54 +36,50 @@ class SceneInfo:
     """
 
     file: str
-    """The path of the scene; empty for Gaussians in memory, whose format is empty too, and whose
-    size is 0."""
+    """Path of the scene; empty for Gaussians in memory, which have no format and 0 bytes."""
     format: str
-    """Name of the format; for a run or a checkpoint in one its method and step."""
+    """Name of the format; for a run or its checkpoint the method and step."""
     bytes: int
     gaussians: int
     sh_degree: int
     antialiased: bool
-    """Whether the scene was trained with antialiasing, as its file or run says."""
+    """Whether the scene was trained with antialiasing, according to its file or run."""
     offset: list[float]
-    """Where the origin of positions lies in the frame of the file, scene units; empty if they are
-    in that frame."""
+    """Origin of positions in the frame of the file, scene units; empty if both frames are the
+    same."""
     up: list[float]
-    """The direction that is up, of length 1; empty if nothing is visible."""
+    """Up direction, of length 1; empty if nothing is visible."""
     up_is_guess: bool
-    """Whether it was estimated without evidence that agrees."""
+    """Whether the up direction is an uncertain estimate."""
     fill: float | None
-    """Mean number of Gaussians drawn per pixel
-    (:func:`pointsplat_ns.rendering.comparison.fill.fill`) in sampled views; None if there are
-    none."""
+    """Mean number of Gaussians drawn per pixel in sampled views
+    (:func:`pointsplat_ns.rendering.comparison.fill.fill`); None without views."""
     views: str
-    """Number and size of these views, as text."""
+    """Number and size of the sampled views, as text."""
     sh_energies: list[float]
     """Mean square of the contribution of each band to the colours, from degree 1 on."""
     opacities: list[int]
-    """Gaussians by opacity, in ten bins from 0 to 1."""
+    """Histogram of opacities, ten bins from 0 to 1."""
     sizes: dict[str, int]
-    """Gaussians by their largest standard deviation, scene units: powers of ten, by their lower
-    bound."""
+    """Histogram of the largest standard deviation, scene units; bins are powers of ten, named by
+    their lower bound."""
     bounds: list[list[float]]
-    """Lowest and highest corner of all positions."""
+    """Lower and upper corner of the bounding box of all positions."""
     content: list[list[float]]
-    """Corners of the middle 96 % of positions along each axis."""
+    """Corners of the box of the middle 96 % of positions along each axis."""
     suspicious: dict[str, int]
-    """Number of rows by kind of defect; kinds without rows are left out."""
+    """Number of rows by kind of defect, without kinds that do not occur."""
 
     @property
     def up_text(self) -> str:
-        """The direction that is up, named or in numbers, and whether it is a guess; "unknown" if
-        nothing is visible."""
-        return (
-            str(Up(torch.tensor(self.up, **DOUBLES), not self.up_is_guess))
-            if self.up
-            else "unknown"
-        )
+        """Name or coordinates of the up direction, and whether it is a guess; "unknown" if nothing
+        is visible."""
+        if not self.up:
+            return "unknown"
+        return str(Up(torch.tensor(self.up, **DOUBLES), not self.up_is_guess))
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures as numbers, lists and dictionaries that JSON can hold."""
+        """The figures as a dictionary for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -96,14 +91,14 @@ def info(
     """Measure a scene.
 
     Args:
-        scene: N Gaussians, or the path of a scene. Undrawable Gaussians of a file are counted too;
-            other functions drop them when reading.
-        resolution: size of the pictures in which fill is counted, pixels; by default 1920x1080.
-        up: the axis that is up, such as "-y"; by default the scene's own, or estimated.
+        scene: N Gaussians, or the path of a scene. Undrawable Gaussians of a file count too; other
+            functions drop them.
+        resolution: size of the pictures for fill, pixels; by default 1920x1080.
+        up: up axis, such as "-y"; by default declared by the scene, or estimated.
 
     Raises:
         SceneError: if the file is not usable.
-        PointSplatError: if the resolution or the axis is none.
+        PointSplatError: if the resolution or the axis is invalid.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -128,12 +123,12 @@ def info(
     source = ViewProvider(good, resolution=size, up=known)
     try:
         views = source.whole()
-        up_found: Up | None = source.sampler.up
-        filled = fill(good, views)
+        direction: Up | None = source.sampler.up
+        mean_fill = fill(good, views)
         views_text = f"{len(views)} views of {views.width} x {views.height} pixels"
     except DataError:  # nothing is visible
-        up_found = known
-        filled = None
+        direction = known
+        mean_fill = None
         views_text = ""
     return SceneInfo(
         file=file,
@@ -143,9 +138,9 @@ def info(
         sh_degree=scene.sh_degree,
         antialiased=scene.antialiased,
         offset=[] if scene.offset is None else [*scene.offset],
-        up=[] if up_found is None else up_found.direction.tolist(),
-        up_is_guess=up_found is not None and not up_found.sure,
-        fill=filled,
+        up=[] if direction is None else direction.direction.tolist(),
+        up_is_guess=direction is not None and not direction.sure,
+        fill=mean_fill,
         views=views_text,
         sh_energies=band_energies(scene),
         opacities=torch.histc(good.alphas, 10, 0.0, 1.0).long().tolist(),
@@ -157,8 +152,8 @@ def info(
 
 
 def _suspicious(scene: Gaussians, usable: Tensor) -> dict[str, int]:
-    found = torch.cat([value.flatten(1) for value in scene.tensors()], dim=1)
-    nan = found.isnan().any(dim=1)
+    values = torch.cat([value.flatten(1) for value in scene.tensors()], dim=1)
+    nan = values.isnan().any(dim=1)
     good = scene[usable]
     counts = {
         "NaN": int(nan.sum()),
@@ -167,7 +162,7 @@ def _suspicious(scene: Gaussians, usable: Tensor) -> dict[str, int]:
         "too faint to be drawn": int((good.alphas < ALPHA_MIN).sum()),
         "zero quaternion": int((good.quats.abs().amax(dim=1) < SHORTEST).sum()) if len(good) else 0,
     }
-    return {what: count for what, count in counts.items() if count}
+    return {defect: count for defect, count in counts.items() if count}
 
 
 def _by_powers_of_ten(log_sizes: Tensor) -> dict[str, int]:
@@ -181,8 +176,8 @@ def _by_powers_of_ten(log_sizes: Tensor) -> dict[str, int]:
 
 
 def _corners(means: Tensor, outside: float) -> list[list[float]]:
-    """Corners of the box of the positions, without the share ``outside`` of them at each end of
-    each axis."""
+    """Corners of the box of positions, without the share ``outside`` of them at either end of each
+    axis."""
     if not len(means):
         return []
     ranked = means.sort(dim=0).values

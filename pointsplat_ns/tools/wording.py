@@ -1,4 +1,4 @@
-"""Sentences on results: the one place where numbers become text, for commands, pages and logs."""
+"""Turns results into sentences for commands, pages and logs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from pointsplat_ns.pipeline.acceptance import closer_in
+from pointsplat_ns.pipeline.acceptance import views_improved
 from pointsplat_ns.pipeline.cleaning import Cleaning, Rule, RuleEffect
 from pointsplat_ns.pipeline.quality import PhotoGain, Quality
 from pointsplat_ns.pipeline.reasons import Cause, Reason
@@ -36,38 +36,38 @@ IMPRESSIONS = (
     (21.0, "small things are lost"),
     (0.0, "only large shapes are left"),
 )
-"""The impression of a PSNR against the dense scene, dB, from its lower bound on: what was seen in
-pictures of rooms, statues, a robot and stones at 50, 30, 10 and 3 % of their Gaussians."""
+"""Impression of a PSNR against the dense scene, by lower bound in dB. Observed in pictures of
+rooms, statues, a robot and stones at 50, 30, 10 and 3 % of their Gaussians."""
 
 BEST_PSNR = 60.0
-"""PSNR above which text gives this bound, dB: the rounding of pictures to 256 levels has 59."""
+"""Largest PSNR to print, dB. Rounding pictures to 256 levels has 59 dB."""
 
 
 def decibels(psnr: float) -> str:
-    """A PSNR, dB."""
+    """Text on a PSNR, dB."""
     return f"more than {BEST_PSNR:g} dB" if psnr > BEST_PSNR else f"{psnr:.1f} dB"
 
 
 def impression(psnr: float) -> str:
-    """What a PSNR against the dense scene, dB, looks like."""
+    """Visual impression of a PSNR against the dense scene, dB."""
     return next((word for least, word in IMPRESSIONS if psnr >= least), IMPRESSIONS[-1][1])
 
 
 def quality_line(psnr: float, ssim: float | None) -> str:
-    """PSNR, dB, and SSIM against the dense scene, and what they look like."""
+    """PSNR (dB) and SSIM against the dense scene, and the visual impression."""
     similarity = "" if ssim is None else f", SSIM {ssim:.2f}"
     return f"{decibels(psnr)}{similarity}: {impression(psnr)}"
 
 
 def photo_gain_text(gain: PhotoGain) -> str:
-    """What training on photos gained."""
+    """Gain of training on photos."""
     if gain.accepted:
         return f"{gain.before:.1f} -> {gain.after:.1f} dB in {gain.photos} training photos"
-    return f"{gain.before:.1f} dB in {gain.photos} photos, which training on them does not raise"
+    return f"{gain.before:.1f} dB in {gain.photos} photos, not improved by training on them"
 
 
 def quality_text(quality: Quality) -> str:
-    """The line that users read of a result."""
+    """The main line on the quality of a result."""
     line = quality_line(quality.psnr, quality.ssim)
     if quality.photos is not None:
         gain = photo_gain_text(quality.photos)
@@ -77,8 +77,8 @@ def quality_text(quality: Quality) -> str:
         line = f"{gain}; {line}"
     if quality.opacity < LEAST_OPACITY:
         line += (
-            "; the dense scene is translucent from everywhere (mean opacity "
-            f"{100 * quality.opacity:.0f} %), as it is just behind an opacity reset"
+            "; the dense scene is translucent in all views (mean opacity "
+            f"{100 * quality.opacity:.0f} %), as just after an opacity reset"
         )
     return line
 
@@ -96,7 +96,7 @@ def quality_lines(quality: Quality) -> tuple[str, ...]:
 
 
 def quality_details(quality: Quality) -> str:
-    """A line with the other figures of a result."""
+    """A line with further figures of a result."""
     views = f"{views_text(quality.views)} of {quality.width} x {quality.height} pixels"
     fills = f"{quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
     return (
@@ -106,7 +106,7 @@ def quality_details(quality: Quality) -> str:
 
 
 def quality_json(quality: Quality | None) -> dict[str, Any]:
-    """The figures of a result and their line, for JSON."""
+    """Figures of a result and their line, for JSON."""
     if quality is None:
         return {"psnr": None}
     gain = quality.photos
@@ -140,12 +140,12 @@ def views_text(count: int) -> str:
 
 
 def views_of_size(views: Views) -> str:
-    """The number of views, and their size."""
+    """Number and size of views."""
     return f"{views_text(len(views))} of {views.width} x {views.height} pixels"
 
 
 def origin_text(origin: ViewOrigin | None) -> str:
-    """Where views came from; empty if there are none."""
+    """Origin of views; empty if there are none."""
     if origin is None:
         return ""
     if origin.kind is Origin.SAMPLED:
@@ -154,31 +154,31 @@ def origin_text(origin: ViewOrigin | None) -> str:
 
 
 def missing_text(missing: str) -> str:
-    """Why a run's dataset gives no poses, in brackets; empty if it does."""
+    """Error of reading poses from a run's dataset, in brackets; empty if there was none."""
     return f" (no dataset: {missing})" if missing else ""
 
 
 def closeness_text(close: Closeness) -> str:
-    """In which views renders were compared."""
+    """Number and width of the compared views."""
     width = "" if close.width is None else f" of {close.width} pixels"
     return views_text(len(close.errors)) + width
 
 
 def reason_text(reason: Reason) -> str:
-    """Why a stage is left out."""
+    """Reason to reject a stage."""
     if reason.cause is Cause.NOT_FINITE:
         return f"{reason.count:,} of {reason.total:,} Gaussians are not finite"
     if reason.cause is Cause.NOT_COMPARED:
-        return f"it cannot be compared with the dense scene ({reason.error})"
+        return f"no comparison with the dense scene ({reason.error})"
     if reason.cause is Cause.SMALL_GAIN:
-        return f"it gains less than {reason.decibels:g} dB"
+        return f"gain below {reason.decibels:g} dB"
     if reason.cause is Cause.WORSE_IN_OTHER_PHOTOS:
         return f"other photos lose {reason.decibels:.1f} dB"
     return {
-        Cause.NO_CHANGE: "it changes nothing",
-        Cause.NO_GAIN: "it does not help",
+        Cause.NO_CHANGE: "no change",
+        Cause.NO_GAIN: "no gain",
         Cause.WORSE_IN_MOST_VIEWS: "error increased in most views",
-        Cause.WORSE_IN_OTHER_SIZES: "it harms pictures of another size",
+        Cause.WORSE_IN_OTHER_SIZES: "PSNR decreased in pictures of other sizes",
     }[reason.cause]
 
 
@@ -190,15 +190,13 @@ STAGES = {
     "photos": "trained",
     "round": "rounded",
 }
-"""What each stage does to a scene, as a participle."""
+"""Participle for the effect of each stage."""
 
 
 def stage_text(result: StageResult) -> str:
-    """What a stage gains, or why it is left out."""
+    """Gain of a stage, or the reason to reject it."""
     done = STAGES[result.stage]
-    done += {"refine": " by the network", "round": " for the size of the file"}.get(
-        result.stage, ""
-    )
+    done += {"refine": " by the network", "round": " for the file size"}.get(result.stage, "")
     figures = ""
     if result.photos is not None:
         done += f" on {result.photos.used} photos"
@@ -213,22 +211,22 @@ def stage_text(result: StageResult) -> str:
         cost = f" by {counted(result.steps, 'step')} in {result.seconds:.1f} s"
     if result.interrupted:
         cost += ", interrupted"
-    why = ""
+    reason = ""
     if result.reason is not None:
-        why = f"{', ' if figures else ': '}{reason_text(result.reason)}"
-    refused = "" if result.accepted else "not "
-    return f"{refused}{done}{cost}{why}" + (f": {figures}" if figures else "")
+        reason = f"{', ' if figures else ': '}{reason_text(result.reason)}"
+    negation = "" if result.accepted else "not "
+    return f"{negation}{done}{cost}{reason}" + (f": {figures}" if figures else "")
 
 
 def _errors_text(before: Closeness, after: Closeness) -> str:
     gain = f"{before.psnr:.1f} -> {after.psnr:.1f} dB PSNR against the dense scene"
-    closer = closer_in(before, after)
+    closer = views_improved(before, after)
     worst = f"worst {before.worst:.1f} -> {after.worst:.1f} dB, better in {closer}"
     return f"{gain} ({closeness_text(before)}; {worst})"
 
 
 def verdict_text(report: Report) -> str:
-    """A line for each stage after pruning: its gain, or why it is left out. One line if there is no
+    """A line per stage after pruning: its gain, or the reason to reject it. One line if there is no
     such stage."""
     lines = [stage_text(result) for result in report.stages[1:]]
     if lines:
@@ -243,7 +241,7 @@ def verdict_text(report: Report) -> str:
 
 
 def sh_text(cut: ShCut) -> str:
-    """The SH bands that were cut."""
+    """Text on a cut of SH bands."""
     if cut.after >= cut.before:
         return f"SH degree {cut.before} kept"
     reached = "" if cut.psnr is None else f", {cut.psnr:.1f} dB PSNR against all bands"
@@ -254,11 +252,11 @@ def sh_text(cut: ShCut) -> str:
 
 
 def cleaning_lines(cleaning: Cleaning) -> tuple[str, ...]:
-    """A line for each rule of cleaning."""
+    """A line per rule of cleaning."""
     if not cleaning.effects:
-        spared = len(cleaning.junk.indices)
-        why = f"; {spared:,} could go, but the budget keeps all" if spared else ""
-        return (f"clean: nothing removed{why}",)
+        removable = len(cleaning.junk.indices)
+        spared = f"; the budget keeps all {removable:,} removable Gaussians" if removable else ""
+        return (f"clean: nothing removed{spared}",)
     return tuple(
         f"clean: {effect.removed:,} of {cleaning.count:,} removed {_rule_text(effect)}"
         f"{_effect_text(effect)}"
@@ -271,13 +269,11 @@ def _rule_text(effect: RuleEffect) -> str:
         return "that cannot be drawn"
     if effect.rule is Rule.UNSEEN:
         places = (
-            f"looking around from {effect.places} places"
-            if effect.places
-            else "nothing to look from was found"
+            f"{effect.places} camera positions" if effect.places else "no camera position found"
         )
         return f"that are never visible ({places})"
     found = counted(effect.clusters, "cluster")
-    return f"that float before what {effect.seen_in} views show, {found}"
+    return f"that float in front of the surfaces in {effect.seen_in} views, {found}"
 
 
 def _effect_text(effect: RuleEffect) -> str:
@@ -285,15 +281,15 @@ def _effect_text(effect: RuleEffect) -> str:
         return ""
     seen = views_text(effect.views)
     if math.isinf(effect.psnr):
-        return f"; renders of the {seen} that decided stay the same"
+        return f"; no change in {seen}"
     return (
-        f"; of the {seen} that decided, renders reach {effect.psnr:.1f} dB against the dense "
-        f"scene's, {effect.worst:.1f} dB in the worst"
+        f"; {effect.psnr:.1f} dB against the dense scene in {seen}, {effect.worst:.1f} dB in the "
+        "worst"
     )
 
 
 def search_text(search: PsnrSearch | SizeSearch) -> str:
-    """How the count of a budget was found."""
+    """Text on the search for the count of a budget."""
     tried = counted(search.tried, "size")
     if isinstance(search, SizeSearch):
         return f"{tried} tried for {bytes_text(search.bytes)} as {search.format}"
@@ -304,7 +300,7 @@ def search_text(search: PsnrSearch | SizeSearch) -> str:
 
 
 def target_text(target: TargetSearch, views: Views | None = None) -> str:
-    """What a search for a quality reached, in which views or photos, and its cost."""
+    """Reached quality of a search, its views or photos, and its cost."""
     if target.photos:
         photos = counted(target.photos, "held-out photo")
         reached = f"{target.psnr:.1f} dB in {photos}, the dense scene {target.dense_psnr:.1f} dB"
@@ -319,14 +315,13 @@ def held_out_text(found: HeldOut) -> str:
     """PSNR in held-out photos."""
     figures = " -> ".join(f"{psnr:.1f}" for psnr in found.psnrs)
     return (
-        f"held-out photos: {figures} dB PSNR in {found.photos} photos, of the dense scene "
+        f"held-out photos: {figures} dB PSNR in {found.photos} photos, the dense scene "
         f"{found.dense:.1f} dB"
     )
 
 
 def note_lines(report: Report) -> tuple[str, ...]:
-    """Lines on a report: origin of the views, SH bands dropped, what cleaning removed, PSNR
-    reached."""
+    """Lines on a report: origin of views, cut SH bands, cleaning, search."""
     lines: list[str] = []
     if report.origin is not None:
         lines.append(f"views: {origin_text(report.origin)}")
@@ -340,8 +335,8 @@ def note_lines(report: Report) -> tuple[str, ...]:
 
 
 def log_report(report: Report) -> None:
-    """Log what a request found: figures of photos and searches at level INFO, details at level
-    DEBUG. That the poses of a run are missing is at level INFO, too."""
+    """Log a report: photos, searches and missing poses of a run at level INFO, details at level
+    DEBUG."""
     if report.no_held_out:
         logger.info("there are no held-out photos: %s", report.no_held_out)
     notes = note_lines(report)

@@ -32,10 +32,14 @@ def test_clean_writes_what_the_function_returns_and_a_picture(room, capsys):
         5 <= removed < 1257
         and f"room_clean.ply: cleaned to {len(written):,} of {all_of_them} Gaussians" in said
     )
-    assert "float before what 40 views show" in said and "cluster" in said and " dB, SSIM " in said
+    assert (
+        "float in front of the surfaces in 40 views" in said
+        and "cluster" in said
+        and " dB, SSIM " in said
+    )
     assert (
         picture.read_bytes()[:4] == b"\x89PNG"
-        and f"{picture}: the scene, what goes, and the result" in said
+        and f"{picture}: the scene, the removed Gaussians and the result" in said
     )
 
 

@@ -134,7 +134,7 @@ def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, cap
     page = Path(f"my room_{goal}.html")
     run("compact", "my room.ply", "--for", goal)
     said = capsys.readouterr().out
-    assert "all 150 Gaussians fit as they are" in said and len(read_scene(file)) == 150
+    assert "all 150 Gaussians remain" in said and len(read_scene(file)) == 150
     assert page.exists() == wanted.page and ("smaller --keep lowers it" in said) == (
         goal == "headset"
     )
@@ -152,7 +152,7 @@ def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, cap
     )
     refused = refusal(capsys, tmp_path, *words, "-o", "small.ply")
     assert (
-        f"small.ply: --for {goal} writes {wanted.suffix}; expected such a name, or --keep in place"
+        f"small.ply: --for {goal} writes {wanted.suffix}; expected that suffix, or --keep in place"
         in refused
     )
 

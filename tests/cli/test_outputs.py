@@ -15,7 +15,7 @@ from making import ball
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.pipeline import repair
-from pointsplat_ns.pipeline.repair_state import Unfinished
+from pointsplat_ns.pipeline.repair_state import RepairStateFile
 from pointsplat_ns.pruning.merging.cells import Scratch
 from pointsplat_ns.system import files, outputs
 
@@ -227,13 +227,13 @@ def test_a_claim_that_a_killed_command_or_a_stranger_left_refuses_nothing(
 
 
 def test_a_repair_of_another_version_does_not_continue(tmp_path, monkeypatch):
-    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)
+    monkeypatch.setattr(RepairStateFile, "SECONDS", 0.0)
     scene = ball(4, opacity=1.0, bright=1.0)
     state = dict(scene.items())
-    Unfinished(tmp_path / "state", scene, "work").save(3, lambda: state)
-    assert Unfinished(tmp_path / "state", scene, "work").state(state) is not None
+    RepairStateFile(tmp_path / "state", scene, "work").save(3, lambda: state)
+    assert RepairStateFile(tmp_path / "state", scene, "work").state(state) is not None
     monkeypatch.setattr(ps, "__version__", "0.0.0")
-    assert Unfinished(tmp_path / "state", scene, "work").state(state) is None
+    assert RepairStateFile(tmp_path / "state", scene, "work").state(state) is None
 
 
 def test_steps_in_cells_stay_after_an_error_only_if_one_was_taken(tmp_path, monkeypatch):

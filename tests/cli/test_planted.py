@@ -15,7 +15,7 @@ import pointsplat_ns as ps
 from making import ball, normal_scene
 from pointsplat_ns.cli import main
 from pointsplat_ns.pipeline import repair_budget
-from pointsplat_ns.pipeline.repair_state import Unfinished
+from pointsplat_ns.pipeline.repair_state import RepairStateFile
 from pointsplat_ns.pruning.merging.cells import Scratch
 from pointsplat_ns.scene.discovery import FOLDER_FILES
 
@@ -186,7 +186,7 @@ def secret(tmp_path, monkeypatch) -> Path:
 
 @pytest.mark.parametrize("name", LINKS)
 def test_nothing_is_written_or_removed_through_a_link_that_nobody_named(name, secret, monkeypatch):
-    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)  # the state of a repair is written at once
+    monkeypatch.setattr(RepairStateFile, "SECONDS", 0.0)  # the state of a repair is written at once
     monkeypatch.setitem(repair_budget.STEPS, "quick", 4)
     link = Path(name)
     link.parent.mkdir(parents=True, exist_ok=True)
@@ -237,14 +237,14 @@ def test_a_result_with_its_record_is_not_replaced_through_a_link(secret, capsys)
 
 
 def test_the_state_of_a_repair_is_not_read_through_a_link(secret, monkeypatch):
-    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)
+    monkeypatch.setattr(RepairStateFile, "SECONDS", 0.0)
     scene = normal_scene(8)
     state = dict(scene.items())
-    Unfinished(secret, scene, "work").save(3, lambda: state)
-    assert Unfinished(secret, scene, "work").state(state) is not None
+    RepairStateFile(secret, scene, "work").save(3, lambda: state)
+    assert RepairStateFile(secret, scene, "work").state(state) is not None
     link = Path(".room_compact.ply.unfinished")
     link.symlink_to(secret)
-    assert Unfinished(link, scene, "work").state(state) is None
+    assert RepairStateFile(link, scene, "work").state(state) is None
 
 
 @pytest.mark.parametrize("planted", ["folder", "step"])

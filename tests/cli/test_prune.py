@@ -99,7 +99,7 @@ def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(tmp_path, c
     poses = written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")
     run("prune", room, "--keep", "2MB", "--poses", poses, "-o", tmp_path / f"small{suffix}")
     said = capsys.readouterr().out
-    assert "nothing is merged, all 300 Gaussians fit as they are" in said
+    assert "nothing is merged, all 300 Gaussians remain" in said
     assert "\nmore than 60 dB, SSIM 1.00: looks the same\n" in said or suffix != ".ply"
     assert re.search(r"(?m)^(more than )?[\d.]+ dB, SSIM \d.\d\d: ", said) and "inf" not in said
 
@@ -177,7 +177,7 @@ def test_several_processes_write_the_bytes_of_one_also_after_a_kill(tmp_path):
 def test_several_jobs_for_a_scene_that_fits_into_memory_are_refused(tmp_path, capsys):
     write_ply(normal_scene(50), tmp_path / "scene.ply")
     words = ("prune", tmp_path / "scene.ply", "--keep", "10%", "--jobs")
-    fits = "scene.ply: fits into memory; --jobs is for a scene that is merged in parts"
+    fits = "scene.ply: fits into memory; expected no --jobs, which is for merging in parts"
     assert fits in refusal(capsys, tmp_path, *words, 2)
     assert "jobs is 0; expected 1 or more" in refusal(
         capsys, tmp_path, *words, 0, "--memory", "10kB"

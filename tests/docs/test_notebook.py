@@ -10,12 +10,12 @@ NOTEBOOK = Path(__file__).parents[2] / "docs" / "quickstart.ipynb"
 SMALLER = """
 import pointsplat_ns as ps
 from pointsplat_ns import api
-from pointsplat_ns.pipeline import repair
+from pointsplat_ns.pipeline import repair_budget
 from pointsplat_ns.pipeline import view_provider
 
 ps.save(ps.example_room()[::30], "room.ply")
 api.EXAMPLE = "room.ply"
-repair.STEPS["quick"] = 2
+repair_budget.STEPS["quick"] = 2
 view_provider.RESOLUTION = (64, 48)
 """
 """Run before all cells: the scene that ships cut to a thirtieth, a repair of two steps,

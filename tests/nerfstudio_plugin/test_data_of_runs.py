@@ -123,7 +123,7 @@ def test_a_run_without_its_data_does_not_stop_a_folder_and_is_named(
         and "gone_from_here" in results[1].note
     )
     assert json.loads((tmp_path / "out" / "wall-b.ply.json").read_text())["note"] == results[1].note
-    with pytest.raises(SceneError, match="holds results of other options"):
+    with pytest.raises(SceneError, match="contains results of other options"):
         ps.compact_folder(runs, tmp_path / "out", "50%", effort="instant", data=moved)
     results = ps.compact_folder(runs, tmp_path / "new", "50%", effort="instant", data=moved)
     assert [(result.status, result.note) for result in results] == [("done", ""), ("done", "")]

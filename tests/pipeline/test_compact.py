@@ -12,7 +12,7 @@ import pointsplat_ns.pipeline.stages as stages_module
 from making import ball, same
 from pointsplat_ns.api import Compacted
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.pipeline.acceptance import closer_in
+from pointsplat_ns.pipeline.acceptance import views_improved
 from pointsplat_ns.pipeline.compact_scene import compact_scene
 from pointsplat_ns.pipeline.options import CompactOptions
 from pointsplat_ns.pipeline.repair import Repaired
@@ -137,7 +137,7 @@ def test_without_views_refinement_is_left_out_with_the_reason(scene):
     assert not result.accepted and same(result.scene, prune(scene, 0.5, "opacity"))
     assert result.reference is None and result.views is None and result.psnr is None
     assert result.verdict == (
-        "not refined by the network: it cannot be compared with the dense scene (no free place to "
+        "not refined by the network: no comparison with the dense scene (no free place to "
         "look at the scene from was found)"
     )
 
@@ -213,7 +213,7 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired
     monkeypatch.setattr(DenseReference, "closeness", closeness)
     result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, **REPAIRED)
     assert same(result.scene, pruned) and result.repaired.after.psnr > result.before.psnr + 3
-    assert closer_in(result.before, result.repaired.after) == 1
+    assert views_improved(result.before, result.repaired.after) == 1
     assert result.verdict.startswith("not refined by the network, error increased in most views: ")
     assert "not repaired by 5 steps in 0.5 s, error increased in most views: " in result.verdict
 
@@ -232,5 +232,5 @@ def test_a_repair_that_harms_pictures_of_another_size_is_left_out(scene, monkeyp
     left = compacted(scene, None, large, **options)
     assert not left.repair_accepted and same(left.scene, left.pruned)
     assert left.verdict.startswith(
-        "not repaired by 5 steps in 0.5 s, it harms pictures of another size: "
+        "not repaired by 5 steps in 0.5 s, PSNR decreased in pictures of other sizes: "
     )

@@ -104,7 +104,7 @@ def test_each_lap_has_the_photos_in_another_order_and_other_pixels(hollow_ball, 
         (8.0, 0.4, 1.5, ["photos"], "trained on 15 photos by 40"),
         (8.0, -0.4, 20.0, ["repair", "photos"], "trained on 15 photos by 40"),
         (8.0, -0.4, 1.5, ["repair", "photos"], "other photos lose"),
-        (1e4, 0.4, 1.5, ["repair", "photos"], "gains less than 0.1 dB"),
+        (1e4, 0.4, 1.5, ["repair", "photos"], "gain below 0.1 dB"),
     ],
 )
 def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
@@ -134,7 +134,7 @@ def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
     assert stage.accepted == kept and text in stage_text(stage)
     assert (result.scene is stage.scene) == kept
     assert stage.photos is not None
-    assert stage.photos.before == stage.photos.beside(result.stages[-2].scene, photos).before
+    assert stage.photos.before == stage.photos.against(result.stages[-2].scene, photos).before
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_a_large_scene_is_repaired_first_and_more_pixels_are_drawn(
         "every_kth_pixel",
         lambda photo, side, *rest: sides.add(side) or every_kth_pixel(photo, side, *rest),
     )
-    monkeypatch.setattr(repair_budget, "FEW", 75)
+    monkeypatch.setattr(repair_budget, "FEW_GAUSSIANS", 75)
     options = CompactOptions(keep=300, photos=True).completed()
     result = compact_scene(hollow_ball, options, FewViews(hollow_ball), photos=photos)
     last = result.stages[-1]
@@ -161,7 +161,7 @@ def test_a_large_scene_is_repaired_first_and_more_pixels_are_drawn(
     )
     assert last.photos is not None
     assert last.photos.before == mean_psnr(
-        result.stages[-2].scene, photos, module._roles(len(photos))[1]
+        result.stages[-2].scene, photos, module._photo_roles(len(photos))[1]
     )
 
 

@@ -76,7 +76,7 @@ def test_a_scene_that_is_translucent_from_everywhere_is_said_to_be(dense):
     views = sample_views(dense, 3, 64, 48)
     reset = dense.replace(opacities=torch.full_like(dense.opacities, -5.0))
     found = Judge(reset, ViewProvider(reset, views)).quality(reset[::3])
-    assert 0 < found.opacity < 0.5 and "translucent from everywhere (mean opacity " in quality_text(
+    assert 0 < found.opacity < 0.5 and "translucent in all views (mean opacity " in quality_text(
         found
     )
     opaque = Judge(dense, ViewProvider(dense, views)).quality(dense[::3])

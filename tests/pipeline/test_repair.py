@@ -25,7 +25,7 @@ from pointsplat_ns.pipeline.optimiser import (
 from pointsplat_ns.pipeline.photos.examples import Example
 from pointsplat_ns.pipeline.repair import repair
 from pointsplat_ns.pipeline.repair_budget import STEPS, RepairBudget
-from pointsplat_ns.pipeline.repair_state import Unfinished
+from pointsplat_ns.pipeline.repair_state import RepairStateFile
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rendering import render
@@ -78,7 +78,7 @@ def test_repairs_of_many_gaussians_take_more_steps_views_and_pixels_at_lower_rat
     hollow_ball, pruned, monkeypatch
 ):
     monkeypatch.setitem(STEPS, "quick", 4)
-    monkeypatch.setattr(repair_budget, "FEW", 75)
+    monkeypatch.setattr(repair_budget, "FEW_GAUSSIANS", 75)
     asked = []
 
     class Counted(FewViews):
@@ -90,7 +90,7 @@ def test_repairs_of_many_gaussians_take_more_steps_views_and_pixels_at_lower_rat
         pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None
     )
     assert repaired.steps == 8 and asked == [(2 * VIEW_COUNTS.stepped, 453)]
-    monkeypatch.setattr(repair_budget, "FEW", 1e-9)
+    monkeypatch.setattr(repair_budget, "FEW_GAUSSIANS", 1e-9)
     still = repair(
         pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None
     ).scene
@@ -141,7 +141,7 @@ def test_an_interruption_loses_nothing(hollow_ball, pruned):
 
 
 def test_a_killed_repair_continues_to_the_same_bits(hollow_ball, pruned, tmp_path, monkeypatch):
-    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)
+    monkeypatch.setattr(RepairStateFile, "SECONDS", 0.0)
     file = tmp_path / "unfinished"
 
     def repaired(killed_at=99.0, start=pruned):

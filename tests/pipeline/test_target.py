@@ -98,8 +98,8 @@ def test_ctrl_c_gives_the_smallest_scene_so_far_if_any_reaches_it(dense, monkeyp
         ({"target_db": 90.0, "target_format": ".spz"}, "all 400 Gaussians reach .* dB, not 90 dB"),
         ({"target_db": math.nan}, "--target-db is nan"),
         ({"target_db": 0.0}, "--target-db is 0"),
-        ({"target_db": 30.0, "keep": "10%"}, "expected it without a budget"),
-        ({"target_db": 30.0, "photos": "photos"}, "expected it without photos"),
+        ({"target_db": 30.0, "keep": "10%"}, "expected no --keep"),
+        ({"target_db": 30.0, "photos": "photos"}, "expected no --photos"),
         ({"target_db": 30.0, "target_format": ".bmp"}, "bmp"),
     ],
 )
@@ -116,5 +116,5 @@ def test_scenes_of_a_folder_each_reach_it(tmp_path, dense, views):
     assert ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=24.0) == [
         replace(result, status="done before")
     ]
-    with pytest.raises(PointSplatError, match="holds results of other options"):
+    with pytest.raises(PointSplatError, match="contains results of other options"):
         ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=25.0)

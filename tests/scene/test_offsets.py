@@ -12,7 +12,7 @@ from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
 from making import ball, cloud, same_bits
-from pointsplat_ns.pipeline.photos.posed_scene import read_found
+from pointsplat_ns.pipeline.photos.posed_scene import read_scene_and_cameras
 from pointsplat_ns.scene.offsets import offset_for
 from posing import inria, written
 
@@ -117,7 +117,7 @@ def test_poses_of_a_file_are_in_the_frame_of_the_scene_s_file(tmp_path):
         tuple(-value for value in UTM)
     )
     written(inria(there), tmp_path / "cameras.json")
-    dense, given, _ = read_found(tmp_path / "a.ply", tmp_path / "cameras.json")
+    dense, given, _ = read_scene_and_cameras(tmp_path / "a.ply", tmp_path / "cameras.json")
     with torch.no_grad():
         assert float(ps.psnr(ps.render(dense, given), ps.render(scene, views)).mean()) > 50
 

@@ -66,7 +66,7 @@ def test_what_is_finished_is_not_made_again_and_what_is_not_is(folder, made):
 def test_other_options_need_another_folder_or_force(folder):
     settle(folder)
     with pytest.raises(
-        SceneError, match=r"holds results of other options, see pointsplat-scenes.json.*--force"
+        SceneError, match=r"contains results of other options, see pointsplat-scenes.json.*--force"
     ):
         settle(folder, "10%")
     assert {result.status for result in settle(folder, "10%", force=True).values()} == {"done"}

@@ -43,7 +43,7 @@ def test_photos_lead_where_they_were_trained_on():
     )
     left_out = replace(SOME, photos=PhotoGain(19.24, 19.1, 12, accepted=False))
     assert quality_text(left_out) == (
-        "19.2 dB in 12 photos, which training on them does not raise; 28.8 dB, SSIM 0.91: edges "
+        "19.2 dB in 12 photos, not improved by training on them; 28.8 dB, SSIM 0.91: edges "
         "of small things blur"
     )
 

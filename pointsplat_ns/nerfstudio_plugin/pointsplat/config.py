@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import sys
 from dataclasses import dataclass, field
 from typing import Literal, cast
 
@@ -35,6 +34,7 @@ from pointsplat_ns.system.processes import (
     rank,
     torchrun_rank,
 )
+from pointsplat_ns.system.terminal import say
 
 REFINER_RATES = {
     "encoder": 1e-4,
@@ -57,6 +57,10 @@ class SilentWriter(LocalWriter):
 
     def write_stats_log(self, step: int) -> None:
         """Print nothing."""
+
+
+ENDLESS = 1 << 40
+"""A number of steps that no time allows; with more added to it, tensorboard can count to it."""
 
 
 @dataclass
@@ -139,7 +143,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     def print_to_terminal(self) -> None:
         """As nerfstudio's, by the first process; before, how scenes are pruned."""
         if rank() == 0:
-            print(selection_text(self.model_config.prune_settings()), flush=True)
+            say(selection_text(self.model_config.prune_settings()), flush=True)
             super().print_to_terminal()
 
     def save_config(self) -> None:
@@ -155,7 +159,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         """
         config = copy.deepcopy(self)
         if config.seconds is not None:
-            config.max_num_iterations = sys.maxsize
+            config.max_num_iterations = ENDLESS
         for group in config.optimizers.values():
             group["optimizer"].lr *= self.rate_factor
             if self.global_norm is not None:

@@ -247,7 +247,7 @@ def print_summary(summary: dict[str, Any]) -> None:
         section=len(variants),
     )
     if said := verdict(gains_of(summary)):
-        print(said)
+        say(said)
     others = [name for name, scene in scenes.items() if scene["reference"] != reference]
     if others:
         say(f"compared with {RENDERS}, and in no mean: {', '.join(others)}")

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
+from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.frames import Frames
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, RenderedDataset
 from pointsplat_ns.pruning import PruneSettings
@@ -230,10 +230,10 @@ def count_of(scene: DenseScene) -> int | None:
     try:
         usable = scene.dense(keep=True).usable()
     except PointSplatError as error:
-        CONSOLE.log(f"{scene.name} is left out: {error}")
+        log(f"{scene.name} is left out: {error}")
         return None
     if not bool(usable.any()):
-        CONSOLE.log(f"{scene.name} is left out: none of its Gaussians can be drawn")
+        log(f"{scene.name} is left out: none of its Gaussians can be drawn")
         return None
     return len(usable)
 

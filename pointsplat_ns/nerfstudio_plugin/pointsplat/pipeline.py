@@ -36,6 +36,7 @@ from pointsplat_ns.pipeline.trained_refiner import network_options
 from pointsplat_ns.refinement import save_refiner
 from pointsplat_ns.scene.runs import RUN_FILES
 from pointsplat_ns.system import processes
+from pointsplat_ns.system.terminal import say
 
 MODEL_METADATA = (
     "size",
@@ -123,7 +124,7 @@ class PointSplatPipeline(VanillaPipeline):
         self.seconds = 0.0
         """Duration of the training so far, also before it was resumed."""
         if processes.rank() == 0:
-            print(selection_text(config.model.prune_settings()), flush=True)
+            say(selection_text(config.model.prune_settings()), flush=True)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What checkpoints hold beside weights and optimisers, for torch's ``state_dict``."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torch.optim.lr_scheduler import LambdaLR
 
-from pointsplat_ns.errors import PointSplatError, printable
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import labelled
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import ScenePiece
@@ -42,6 +42,7 @@ from pointsplat_ns.refinement.schedules import cosine_factor
 from pointsplat_ns.scene.runs import RUN_FILES
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.quantities import counted
+from pointsplat_ns.system.terminal import say
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.config import PointSplatTrainerConfig
@@ -75,6 +76,7 @@ class PointSplatTrainer(StoppableTrainer):
     pipeline: PointSplatPipeline
     clock = staticmethod(time.monotonic)
     """Seconds since any moment."""
+    stop_training = False  # nerfstudio sets it in train()
     _last_step = sys.maxsize
 
     def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:
@@ -100,8 +102,11 @@ class PointSplatTrainer(StoppableTrainer):
                 else f"{self.config.seconds:g} s"
             )
             watch = f"tensorboard --logdir {self.base_dir}; numbers in {self.base_dir / CURVES}"
-            say(f"training for {length} on {counted(len(manager.training_names), 'scene')}")
-            say(f"watch it: {watch}")
+            say(
+                f"training for {length} on {counted(len(manager.training_names), 'scene')}",
+                flush=True,
+            )
+            say(f"watch it: {watch}", flush=True)
         super().train()
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
@@ -181,7 +186,7 @@ class PointSplatTrainer(StoppableTrainer):
         words += [f"loss {curves.loss:.4f}"] * bool(curves.losses) + [gains] * bool(gains)
         left = self.seconds_left(done)
         words += [] if left is None else [f"{duration(left)} left"]
-        say("; ".join(words))
+        say("; ".join(words), flush=True)
 
     def _of_all(self) -> str:
         if self.config.seconds is not None:
@@ -207,15 +212,18 @@ class PointSplatTrainer(StoppableTrainer):
             kind = "trained on" if scene.trained_on else "not trained on"
             change = f"pruned {scene.pruned:.1f} -> refined {scene.refined:.1f} dB"
             views = counted(scene.views, "view")
-            say(f"{scene.name} ({kind}): {change} ({scene.gain:+.1f}) in {views}")
-        say(verdict(measured.gains))
-        say(f"see {', '.join(map(str, self.draw()))}")
-        say(f"all held-out photos: ns-eval --load-config {self.base_dir / RUN_FILES.config}")
+            say(f"{scene.name} ({kind}): {change} ({scene.gain:+.1f}) in {views}", flush=True)
+        say(verdict(measured.gains), flush=True)
+        say(f"see {', '.join(map(str, self.draw()))}", flush=True)
+        say(
+            f"all held-out photos: ns-eval --load-config {self.base_dir / RUN_FILES.config}",
+            flush=True,
+        )
 
     def show_progress(self) -> None:
         """See the base class: what :meth:`draw` writes."""
         if self.progress.curves.measurements and processes.rank() == 0:
-            say(f"see {', '.join(map(str, self.draw()))}")
+            say(f"see {', '.join(map(str, self.draw()))}", flush=True)
 
     def draw(self) -> list[Path]:
         """Write the table, the curves and the sheet of views; their paths."""
@@ -300,11 +308,6 @@ class PointSplatTrainer(StoppableTrainer):
     def source_of(self, metrics: dict[str, Any]) -> str:
         """Name of the scene of the latest step."""
         return self.pipeline.datamanager.scenes[metrics["scene"]].name
-
-
-def say(text: str) -> None:
-    """Print a line, whatever its length."""
-    print(printable(text), flush=True)
 
 
 def duration(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""Pictures that are wanted of a scene: photos, or renders of another scene, with their views."""
+"""Target images with their views: photos, or renders of another scene."""
 
 from __future__ import annotations
 
@@ -20,60 +20,56 @@ from pointsplat_ns.scene.views import View
 
 
 class Example(NamedTuple):
-    """A view and the image that is wanted there."""
+    """A view and its target image."""
 
     view: View
     target: Tensor  # [H, W, 3] in [0, 1]
-    mask: Tensor | None = None  # [H, W, 1] bool, the pixels that count; None for all
+    mask: Tensor | None = None  # [H, W, 1] bool, True for valid pixels; None for all
 
     def compared(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """An image of the view and the target on its device, both black where pixels do not
-        count."""
+        """An image of the view, and the target on its device, both black on masked pixels."""
         target = self.target.to(image)
-        return (
-            (image, target)
-            if self.mask is None
-            else (image * self.mask.to(image), target * self.mask.to(image))
-        )
+        if self.mask is None:
+            return image, target
+        mask = self.mask.to(image)
+        return image * mask, target * mask
 
     def psnr(self, image: Tensor) -> float:
-        """PSNR of an image of the view, over the pixels that count, dB; at most ``MOST_PSNR``."""
+        """PSNR of an image of the view over valid pixels, dB; at most ``MOST_PSNR``."""
         image, target = self.compared(image.double())
         counted = 1.0 if self.mask is None else float(self.mask.double().mean())
         return min(psnr_of(float((image - target).square().mean()), counted), MOST_PSNR)
 
 
 Photos = Sequence[Example]
-"""Photos with the views that they show; read when they are asked for. Photos of uint8 count in
-255ths."""
+"""Photos with their views, read lazily. Photos are in [0, 1], or uint8."""
 
 
 @torch.no_grad()
 def mean_psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
-    """Mean PSNR in some of the photos, dB, in every k-th of their pixels."""
-    shown = (
-        every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device) for index in indices
-    )
+    """Mean PSNR over every k-th pixel of the photos at ``indices``, dB."""
+    side = sides_of(*RESOLUTION)[1]
+    shown = (every_kth_pixel(photos[index], side, scene.device) for index in indices)
     return fmean(photo.psnr(render(scene, photo.view)) for photo in shown)
 
 
 @torch.no_grad()
 def render_of(scene: Gaussians, view: View) -> Example:
-    """A view, and what it shows of a scene."""
+    """A view, and its render of a scene as the target."""
     return Example(view, render(scene, view))
 
 
 def every_kth_pixel(
     photo: Example, side: int, device: torch.device, generator: random.Random | None = None
 ) -> Example:
-    """Every k-th pixel of a photo along each axis, and the view that draws exactly these pixels.
+    """Every k-th pixel of a photo along both axes, and the view of exactly these pixels.
 
     Args:
         photo: the whole photo.
-        side: longer side that is wanted, pixels; k is the largest number that leaves at least as
+        side: minimum longer side of the result, pixels; k is the largest factor that leaves as
             many.
-        device: of the result.
-        generator: draws the first column and row; by default the middle of k.
+        device: device of the result.
+        generator: draws the first column and row; by default k // 2.
     """
     view = photo.view
     k = max(1, max(view.width, view.height) // side)

@@ -1,12 +1,12 @@
-"""The frame of a scene that no run of nerfstudio tells of: found by small renders beside photos.
+"""Finds the frame of a scene without a nerfstudio run, by comparing small renders with photos.
 
-Files of cameras have the frame of the data. A scene may have another: nerfstudio and gsplat turn,
-centre and scale the data before they train; programs have different ideas of up, and of the axes of
-cameras; editors scale scenes.
+Camera files use the frame of the data. A scene may use another: nerfstudio and gsplat rotate,
+centre and scale the data before training; conventions for up and camera axes differ; editors scale
+scenes.
 
-Thresholds are chosen on the photos of nine captures. Photos and renders correlate by 0.83 to 0.92
-in the right frame, by at most 0.32 where the world or the cameras are turned by axes, by 0.4 to 0.8
-at four fifths of the scale.
+Thresholds are tuned on nine captures. The correlation of photos and renders is 0.83 to 0.92 in the
+right frame, at most 0.32 with permuted axes of the world or the cameras, and 0.4 to 0.8 at 80 % of
+the scale.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.view_sampling.content import thinned
 
 SAME_SCALE = 0.02
-"""Deviation of a scale from 1 that is left as it is."""
+"""Deviation of a scale from 1 that is ignored."""
 
 Frame = tuple[str, Tensor]
-"""What leads to a frame, and poses (C, 4, 4) from camera to world in it."""
+"""Description of the motion to a frame, and poses (C, 4, 4), camera to world, in it."""
 
 
 def in_frame(
     scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], model: Path
 ) -> Views:
-    """The views of a file of cameras in the frame of a scene, and over the background of its
-    photos, black or white. A frame that is not the given one is named in one line.
+    """Views of a camera file in the frame of a scene, over the background of its photos, black or
+    white. A change of frame is logged in one line.
 
     Args:
         scene: N Gaussians.
-        named: the views, as :func:`~pointsplat_ns.scene.camera_files.read_named_views` gives them.
-        photos: small photos of some of them, by the indices of the views.
-        model: the file of cameras.
+        named: views from :func:`~pointsplat_ns.scene.camera_files.read_named_views`.
+        photos: small photos of some views, by view index.
+        model: path of the camera file.
 
     Raises:
-        DataError: if renders are not like the photos in any frame that was tried.
+        DataError: if renders do not match the photos in any tried frame.
     """
     search = _Search(scene, named, photos, model)
     given = search.fit(search.poses)
@@ -75,10 +75,10 @@ def in_frame(
         search.background = 0.0
     if not _fits(found):
         raise DataError(
-            f"{model}: renders of the scene are unlike the photos in the frame of these poses and "
-            f"in all others that were tried ({given.psnr:.1f} dB PSNR in {given.count} photos, "
+            f"{model}: renders of the scene do not match the photos in the frame of these poses or "
+            f"in any other tried ({given.psnr:.1f} dB PSNR in {given.count} photos, "
             f"correlation {given.own:.2f}; at best {found.psnr:.1f} dB and {found.own:.2f}); "
-            "expected the poses and photos that the scene was trained from, in its frame: put the "
+            "expected the poses and photos of the scene's training, in its frame: put the "
             "dataparser_transforms.json of its run beside the scene, or name other poses (--poses)"
         )
     if words:
@@ -94,14 +94,14 @@ def in_frame(
 
 
 def _fits(found: Likeness) -> bool:
-    """Whether renders are like their photos, and more than like the photos of other views, which
-    show the same object or sky: by three tenths of what is possible. Right frames have eight tenths
+    """Whether renders match their own photos, and clearly better than photos of other views, which
+    show the same object or sky: by at least 30 % of the possible margin. Right frames reach 80 %
     and more."""
     return found.own >= max(MIN_LIKENESS, found.others + 0.3 * (1 - found.others))
 
 
 class _Search:
-    """Tries frames on photos over a background."""
+    """Compares photos with renders in candidate frames over one background."""
 
     def __init__(
         self, scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], model: Path
@@ -119,35 +119,32 @@ class _Search:
         self._known = _known_frames(named, self.poses, model)
 
     def views_of(self, poses: Tensor) -> Views:
-        """Views of poses (C, 4, 4) in the scene's frame."""
+        """Views from poses (C, 4, 4) in the scene's frame."""
         background = torch.full_like(self._views.background, self.background)
         return replace(
             self._views, viewmats=invert_rigid(poses), background=background
         ).relative_to(self._offset)
 
     def fit(self, poses: Tensor, few: bool = False) -> Likeness:
-        """How much renders in poses are like photos, or like a few of them."""
+        """Likeness of renders from poses to all photos, or to a few."""
         views = self.views_of(poses)
         shown: list[Photo] = []
         for index in self._few if few else self._indices:
             view, image, mask = self._photos[index]
-            own = views[index]
-            shown.append(
-                (replace(own, K=view.K, width=view.width, height=view.height), image, mask)
-            )
+            small = replace(views[index], K=view.K, width=view.width, height=view.height)
+            shown.append((small, image, mask))
         return likeness(self._drawn, shown)
 
     def best(self, given: Likeness) -> tuple[Likeness, list[str], Tensor]:
-        """The greatest likeness, what leads to its frame, and poses in it; ``given`` is that of the
-        given frame."""
+        """The greatest likeness, descriptions of the motions to its frame, and poses in it;
+        ``given`` is the likeness in the given frame."""
         found = given
         words = ""
         poses = self.poses
         others = [self._known]
         if given.own < 0.75 or not _fits(given):
-            others.append(
-                [*_turned_frames([frame for frame in self._known if frame[0] in ("", _GSPLAT)])]
-            )
+            turnable = [frame for frame in self._known if frame[0] in ("", _GSPLAT)]
+            others.append([*_turned_frames(turnable)])
         for frames in others:
             text, best = max(
                 frames, key=lambda frame: self.fit(frame[1], few=frames is not self._known).own
@@ -170,8 +167,9 @@ def _scaled(poses: Tensor, factor: float) -> Tensor:
 
 
 def _best_scale(likeness_at: Callable[[float], float]) -> float:
-    """The scale of positions with the greatest likeness: uphill by ever smaller steps, from 1 or,
-    where that is unlike, from the best of a hundredth to a hundred."""
+    """Scale of positions with the greatest likeness, by hill climbing with ever smaller steps. It
+    starts from 1, or from the best of 41 scales between 0.01 and 100 if the likeness at 1 is
+    low."""
     scale = 1.0
     if likeness_at(scale) < MIN_LIKENESS:
         scale = max((1.25**power for power in range(-20, 21)), key=likeness_at)
@@ -197,8 +195,8 @@ _GSPLAT = "normalised as gsplat does"
 
 
 def _known_frames(named: NamedViews, poses: Tensor, model: Path) -> list[Frame]:
-    """Frames that files tell of, and those that nerfstudio and gsplat make of the poses; the given
-    one first."""
+    """Candidate frames: the given one first, then frames from files, then those of nerfstudio and
+    gsplat."""
     frames = [("", poses)]
     raw = poses
     if named.motion is not None:
@@ -208,34 +206,33 @@ def _known_frames(named: NamedViews, poses: Tensor, model: Path) -> list[Frame]:
         frames.append(("applied_transform undone", _undone(named.saved, raw)))
         upright = Motion(torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], **DOUBLES))
         for start in (raw, upright.of(raw)):
-            frames.append(
-                ("oriented, centred and scaled as nerfstudio does", _as_nerfstudio(start))
-            )
+            text = "oriented, centred and scaled as nerfstudio does"
+            frames.append((text, _as_nerfstudio(start)))
         if (points := colmap_points(model)) is not None:
             frames.append((_GSPLAT, _as_gsplat(raw, points)))
     return frames
 
 
 def _turned_frames(frames: list[Frame]) -> Iterator[Frame]:
-    """Frames with the world turned by axes, or the camera axes of OpenGL for those of OpenCV, or
+    """Frames with permuted axes of the world, with OpenGL in place of OpenCV camera axes, or
     both."""
     for text, poses in frames:
         for turn in _axis_turns():
             turned = _turned(poses, turn)
             words = [text, _turn_text(turn)]
             yield ", ".join(filter(None, words)), turned
-            words.append("camera axes y and z turned around")
+            words.append("camera axes y and z flipped")
             yield ", ".join(filter(None, words)), flip_camera_axes(turned)
 
 
 def _turned(poses: Tensor, turn: Tensor, move: Tensor | None = None) -> Tensor:
-    """Poses in a turned world (3, 3), moved by (3,) after that."""
+    """Poses after a rotation (3, 3) of the world and a translation (3,)."""
     move = torch.zeros(3, **DOUBLES) if move is None else move
     return Motion(torch.cat([turn, move[:, None]], dim=1)).of(poses)
 
 
 def _undone(motion: Motion, poses: Tensor) -> Tensor:
-    """Poses before a motion."""
+    """Poses before ``motion``."""
     turn = motion.transform[:, :3]
     move = motion.transform[:, 3]
     before = poses.clone()
@@ -245,17 +242,17 @@ def _undone(motion: Motion, poses: Tensor) -> Tensor:
 
 
 def _as_nerfstudio(poses: Tensor) -> Tensor:
-    """Poses that nerfstudio's dataparsers make of these: the mean of up along z, the mean of
-    positions at the origin, the largest coordinate 1."""
+    """Poses normalised as by nerfstudio's dataparsers: mean up direction along z, mean position at
+    the origin, largest coordinate 1."""
     turn = smallest_turn(_up(poses), torch.tensor([0.0, 0.0, 1.0], **DOUBLES))
     moved = _turned(poses, turn, -(turn @ poses[:, :3, 3].mean(0)))
     return _scaled(moved, 1 / max(float(moved[:, :3, 3].abs().max()), 1e-12))
 
 
 def _as_gsplat(poses: Tensor, points: Tensor) -> Tensor:
-    """Poses that gsplat's examples make of these and of the points (N, 3) of a COLMAP model, up to
-    the signs of axes: the median of the places where cameras look at the origin, the median
-    distance of cameras 1, the principal axes of the points.
+    """Poses normalised as by gsplat's examples with the points (N, 3) of a COLMAP model, up to the
+    signs of axes: centre at the median point that cameras look at, median distance of cameras 1,
+    principal axes of the points.
 
     Source: ``normalize`` in ``examples/datasets/normalize.py`` of gsplat.
     """
@@ -273,13 +270,13 @@ def _as_gsplat(poses: Tensor, points: Tensor) -> Tensor:
 
 
 def _up(poses: Tensor) -> Tensor:
-    """Mean direction of up in the photos, (3,), of length 1."""
+    """Mean up direction of the cameras, (3,), of length 1."""
     up = -poses[:, :3, 1].mean(0)
     return up / up.norm().clamp_min(1e-9)
 
 
 def _axis_turns() -> Iterator[Tensor]:
-    """The 24 rotations (3, 3) of axes to axes, the identity first."""
+    """The 24 rotations (3, 3) that map axes to axes, the identity first."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             turn = torch.zeros(3, 3, **DOUBLES)
@@ -289,10 +286,8 @@ def _axis_turns() -> Iterator[Tensor]:
 
 
 def _turn_text(turn: Tensor) -> str:
-    """The turn as the axes of the scene, in those of the poses' world; empty for none."""
+    """Text on a rotation: axes of the scene in terms of the poses' axes; empty for the identity."""
     axes = [("-" if float(row.sum()) < 0 else "") + "xyz"[int(row.abs().argmax())] for row in turn]
-    return (
-        ""
-        if axes == ["x", "y", "z"]
-        else f"axes x, y, z of the scene are {', '.join(axes)} of the poses"
-    )
+    if axes == ["x", "y", "z"]:
+        return ""
+    return f"axes x, y, z of the scene are {', '.join(axes)} of the poses"

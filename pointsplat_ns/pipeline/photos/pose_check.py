@@ -1,14 +1,14 @@
-"""Whether poses belong to a scene: small renders of a few views tell.
+"""Checks by small renders of a few views whether poses belong to a scene.
 
-A view that belongs to a scene shows it, and sharp: training leaves Gaussians of a few pixels where
+A right view shows the scene, and shows it sharp: training leaves Gaussians of a few pixels where
 photos looked. A camera in a wrong frame looks past the scene, or stands in front of a few large
-Gaussians. Where there are photos, a render is more like its own photo than like the others;
-likeness is a correlation, so that exposure and opacity do not count. Wrong frames that look much
-like the right one (a room upside down, a smaller scale) are found by photos alone.
+Gaussians. With photos, a render must match its own photo better than the others; likeness is a
+correlation, so exposure and opacity do not matter. Wrong frames that resemble the right one (a room
+upside down, a smaller scale) need photos to be detected.
 
-Thresholds are chosen on four scenes of three captures in the poses of their photos, and on twelve
-splats in sampled views. All pass, the splats merged to 1 % as well. Of 13 wrong frames, renders
-alone tell two to eleven; photos tell all but one of 52.
+Thresholds are tuned on four scenes of three captures with the poses of their photos, and on twelve
+splats in sampled views. All pass, even splats merged to 1 %. Renders alone detect two to eleven of
+13 wrong frames per scene; photos detect all but one of 52.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ from pointsplat_ns.view_sampling.content import content_size, thinned, thinning
 
 @dataclass(frozen=True)
 class PoseCheckSettings:
-    """What is drawn for the check."""
+    """Sizes of the renders."""
 
     views: int = 8
-    """Largest number of views that are drawn."""
+    """Maximum number of views."""
     side: int = 96
-    """Longer side of their pictures, pixels."""
+    """Longer side of pictures, pixels."""
     max_count: int = 200_000
-    """About how many Gaussians are drawn at most: every k-th, enlarged."""
+    """Approximate maximum number of Gaussians to draw: every k-th, enlarged."""
 
 
 POSE_CHECK = PoseCheckSettings()
 
 MIN_LIKENESS = 0.5
-"""Mean correlation of renders and their photos that is enough by itself."""
+"""Mean correlation of renders and their photos that suffices by itself."""
 
 
 @dataclass(frozen=True)
 class PoseFaults:
-    """What is wrong with the views of a scene."""
+    """Faults of the views of a scene."""
 
     checked: int
-    """Number of views that were drawn."""
+    """Number of drawn views."""
     empty: int
     """Number of views that show nothing of the scene."""
     smeared: int
@@ -61,7 +61,7 @@ class PoseFaults:
 
     @property
     def serious(self) -> bool:
-        """Whether more than half of the views are wrong."""
+        """Whether more than half of the views are faulty."""
         return 2 * (self.empty + self.smeared) > self.checked
 
     def __str__(self) -> str:
@@ -72,14 +72,12 @@ class PoseFaults:
 
 @torch.no_grad()
 def pose_faults(scene: Gaussians, views: Views) -> PoseFaults:
-    """What is wrong with the views of a scene, found by small renders. A scene that shows nothing
-    has no fault.
+    """Find faults of the views of a scene by small renders. An invisible scene has none.
 
-    A view shows something if the scene covers a hundredth of its picture; objects of captures cover
-    5 % and more. It is sharp if on a quarter of what is covered (the rest may be a sky, or out of
-    focus) Gaussians subtend at most 0.03 radians, or, in scenes of few Gaussians, five times what
-    one of the median size does at half the diagonal of the content; the largest of right poses is
-    three times.
+    A view shows something if the scene covers 1 % of its picture; captured objects cover 5 % and
+    more. It is sharp if Gaussians on a quarter of the covered pixels (the rest may be sky, or out
+    of focus) subtend at most 0.03 radians or, in scenes of few Gaussians, five times the angle of a
+    median Gaussian at half the diagonal of the content; right poses reach up to three times.
     """
     visible = scene.usable() & (scene.alphas >= ALPHA_MIN)
     if not bool(visible.any()) or len(views) == 0:
@@ -102,8 +100,7 @@ def pose_faults(scene: Gaussians, views: Views) -> PoseFaults:
 
 
 def _sharpest_angle(scene: Gaussians, widths: Tensor, pixels: Tensor, view: View) -> float:
-    """The angle, radians, that a quarter of a picture stays below: that of the width of the
-    Gaussian on each pixel."""
+    """Lower quartile over pixels of the angle that a Gaussian's width subtends, radians."""
     viewmat = view.viewmat.to(widths)
     distances = (scene.means.double() @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)
     angles, order = (widths / distances.clamp_min(torch.finfo(torch.float64).tiny)).sort()
@@ -113,28 +110,28 @@ def _sharpest_angle(scene: Gaussians, widths: Tensor, pixels: Tensor, view: View
 
 @dataclass(frozen=True)
 class Likeness:
-    """How much renders of a scene are like photos."""
+    """Likeness of renders to photos."""
 
     own: float
     """Mean correlation of renders with the photos of their views, in [-1, 1]."""
     others: float
     """The same with the photos of other views; 0 if there is one photo."""
     psnr: float
-    """Mean PSNR of renders and the photos of their views, dB."""
+    """Mean PSNR of renders against the photos of their views, dB."""
     count: int
     """Number of photos."""
 
     @property
     def enough(self) -> bool:
-        """Whether renders are like their own photos, or there is none. Right poses have an
-        advantage of 0.43 and more over the photos of other views, wrong frames up to 0.3: a kitchen
-        at half the scale."""
+        """Whether renders match their own photos, or there is no photo. Right poses correlate
+        better with their own photos than with others by at least 0.43, wrong frames by up to 0.3 (a
+        kitchen at half the scale)."""
         return self.count == 0 or self.own >= MIN_LIKENESS or self.own - self.others >= 0.2
 
     def __str__(self) -> str:
         """The figures, for an error where they are not :attr:`enough`."""
         return (
-            "renders of the scene are no more like the photos of their views than like others "
+            "renders of the scene match the photos of their views no better than other photos "
             f"({self.psnr:.1f} dB PSNR in {self.count} photos, correlation {self.own:.2f} and "
             f"{self.others:.2f})"
         )
@@ -146,7 +143,7 @@ Photo = tuple[View, Tensor, Tensor | None]
 
 @torch.no_grad()
 def likeness(scene: Gaussians, photos: Sequence[Photo]) -> Likeness:
-    """How much small renders of a scene are like photos. Masked pixels do not count."""
+    """Likeness of small renders of a scene to photos. Masked pixels are ignored."""
     drawn = thinned(scene, POSE_CHECK.max_count)
     shown = []
     taken = []
@@ -156,21 +153,17 @@ def likeness(scene: Gaussians, photos: Sequence[Photo]) -> Likeness:
         size = max(1, view.height // k), max(1, view.width // k)
         stretch = view.K.new_tensor([[size[1] / view.width], [size[0] / view.height], [1.0]])
         small = replace(view, K=view.K * stretch, width=size[1], height=size[0])
-        counted = (
-            torch.ones(1, *photo.shape[:2], **FLOATS)
-            if mask is None
-            else mask.permute(2, 0, 1).cpu()
-        )
-        weight = F.adaptive_avg_pool2d(counted.double(), size).ge(0.5).double()
-        picture = (
-            F.adaptive_avg_pool2d(in_unit_range(photo).permute(2, 0, 1), size).double().cpu()
-            * weight
-        )
+        if mask is None:
+            valid = torch.ones(1, *photo.shape[:2], **FLOATS)
+        else:
+            valid = mask.permute(2, 0, 1).cpu()
+        weight = F.adaptive_avg_pool2d(valid.double(), size).ge(0.5).double()
+        reduced = F.adaptive_avg_pool2d(in_unit_range(photo).permute(2, 0, 1), size)
+        picture = reduced.double().cpu() * weight
         rendered = render(drawn, small).permute(2, 0, 1).double().cpu() * weight
-        counted_share = max(float(weight.mean()), 1e-9)
-        psnrs.append(
-            min(psnr_of(float((rendered - picture).square().mean()), counted_share), MOST_PSNR)
-        )
+        valid_share = max(float(weight.mean()), 1e-9)
+        error = float((rendered - picture).square().mean())
+        psnrs.append(min(psnr_of(error, valid_share), MOST_PSNR))
         shown.append(_standard(rendered))
         taken.append(_standard(picture))
     own = [float((a * b).sum()) for a, b in zip(shown, taken, strict=True)]
@@ -182,14 +175,14 @@ def likeness(scene: Gaussians, photos: Sequence[Photo]) -> Likeness:
     ]
     count = len(own)
     return Likeness(
-        sum(own) / max(1, count),
-        sum(others) / max(1, len(others)),
-        sum(psnrs) / max(1, count),
-        count,
+        own=sum(own) / max(1, count),
+        others=sum(others) / max(1, len(others)),
+        psnr=sum(psnrs) / max(1, count),
+        count=count,
     )
 
 
 def _standard(picture: Tensor) -> Tensor:
-    """A picture (3, H, W) less the mean of each channel, of length 1; 0 where it is even."""
+    """A picture (3, H, W) minus the mean of each channel, normalised; 0 for a constant picture."""
     varying = picture - picture.mean((1, 2), keepdim=True)
     return varying / varying.norm().clamp_min(1e-9)

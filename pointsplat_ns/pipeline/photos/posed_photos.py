@@ -1,9 +1,8 @@
-"""Photos in a folder with the poses of a file of cameras, for scenes that no run of nerfstudio
-made.
+"""Reads photos from a folder with poses from a camera file, for scenes without a nerfstudio run.
 
-The frame of the poses is checked by small renders of the dense scene, and mended by a similarity
-where one is found. Photos that fit worst are left out. Every eighth photo, by name, is held out of
-training, as INRIA's code, gsplat and nerfstudio do.
+Small renders of the dense scene check the frame of the poses; a similarity corrects it where
+possible. Outlier photos are left out. Every eighth photo, by name, is held out of training, as in
+INRIA's code, gsplat and nerfstudio.
 """
 
 from __future__ import annotations
@@ -41,22 +40,22 @@ from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.view_sampling.content import thinned
 
-LEAST_PHOTOS = 8
-"""Fewer hold none out."""
+MIN_PHOTOS = 8
+"""Minimum number of photos with poses."""
 
 _Read = TypeVar("_Read")
 
 
 @dataclass(frozen=True, eq=False)
 class PosedPhotos:
-    """Photos of a scene, in its frame."""
+    """Photos of a scene, with views in its frame."""
 
     views: Views
-    """The views of all cameras of the file."""
+    """Views of all cameras in the file."""
     training: Photos
     held_out: Photos
     poses: Path
-    """The file of cameras."""
+    """The camera file."""
 
 
 def read_with_photos(
@@ -68,43 +67,41 @@ def read_with_photos(
     progress: Progress = silent,
     training: bool = True,
 ) -> tuple[Gaussians, PosedPhotos]:
-    """Read a scene, and the photos in a folder, reduced to the resolution; they stay in memory, a
-    byte a channel. Photos that cannot be used are named and left out.
+    """Read a scene and the photos in a folder. Photos are reduced to the resolution and stay in
+    memory, one byte per channel. Unusable photos are logged and left out.
 
     Args:
-        scene: N Gaussians, or the path of a scene, beside which cameras and
-            ``dataparser_transforms.json`` are looked for.
-        folder: of the photos.
-        poses: a file of cameras; by default one in the folder of the photos, above it, or beside
-            the scene.
-        data: of a run; expected to be None.
-        resolution: width and height, pixels; the longer side bounds that of photos. By default
+        scene: N Gaussians, or the path of a scene; a camera file and ``dataparser_transforms.json``
+            may lie beside it.
+        folder: folder of the photos.
+        poses: camera file; by default one in the folder of photos, above it, or beside the scene.
+        data: folder of a run's data; must be None.
+        resolution: width and height, pixels; its longer side limits that of photos. By default
             1600.
         progress: called with the name of the current task and the share of it that is done, in [0,
             1].
         training: whether to read the photos that are not held out.
 
     Raises:
-        SceneError: if ``poses`` is no path or None, or ``data`` is named.
-        DataError: if there are no photos or poses, too few of them belong together, or renders of
-            the scene are not like the photos in any frame that was tried; if most photos cannot be
-            used, or they take more memory than is free.
+        SceneError: if ``poses`` is neither a path nor None, or ``data`` is given.
+        DataError: if there are no photos or poses, too few photos have poses, renders of the scene
+            do not match the photos in any tried frame, most photos are unusable, or they exceed the
+            free memory.
     """
     if not (poses is None or isinstance(poses, (str, Path))) or without_poses(poses):
         raise SceneError(
-            f"{folder}: photos need the file with their poses; expected its path, or none to look "
-            "for it"
+            f"{folder}: photos need a camera file with their poses; expected its path, or no "
+            "--poses to look for it"
         )
     if data is not None:
         raise SceneError(
-            f"{data}: the data of a run, but photos are read from {folder}; expected one of both"
+            f"{data}: data of a run, but photos are read from {folder}; expected only one of both"
         )
-    dense, path = (
-        (scene, None) if isinstance(scene, Gaussians) else (read_scene(scene), Path(scene))
-    )
+    path = None if isinstance(scene, Gaussians) else Path(scene)
+    dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
     model, named, files = _posed_files(folder, poses, path)
     order = sorted(files, key=lambda index: named.names[index])
-    held = order[::8]
+    held_out = order[::8]
     side = 1600 if resolution is None else max(resolution)  # as in 3DGS training
     faults: dict[int, DataError] = {}
     masks = model if model.is_dir() else model.parent
@@ -115,7 +112,7 @@ def read_with_photos(
         masked = reader.mask_of(files[index], named.cameras[index]) is not None
         return (4 if masked else 3) * math.prod(reader.size(files[index], named.cameras[index]))
 
-    sizes = _usable(size, sorted(files if training else held), faults)
+    sizes = _usable(size, sorted(files if training else held_out), faults)
     try:
         require_memory(folder, sum(sizes.values()))
     except SceneError as error:
@@ -134,13 +131,16 @@ def read_with_photos(
         lambda done: progress("reading photos", done),
     )
     psnrs = _outliers(dense, examples, progress)
-    for why, lines in (
-        ("cannot be used", [str(error) for error in faults.values()]),
-        ("fit worst", [f"{files[index].name} ({psnr:.1f} dB)" for index, psnr in psnrs.items()]),
+    for fault, lines in (
+        ("are unusable", [str(error) for error in faults.values()]),
+        (
+            "match the scene worst",
+            [f"{files[index].name} ({psnr:.1f} dB)" for index, psnr in psnrs.items()],
+        ),
     ):
         if lines:
             more = f" and {len(lines) - 6} more" if len(lines) > 6 else ""
-            logger.info("photos that %s are left out: %s%s", why, ", ".join(lines[:6]), more)
+            logger.info("photos that %s are left out: %s%s", fault, ", ".join(lines[:6]), more)
     good = [index for index in order if index in examples and index not in psnrs]
     bent = any(
         lens_of(named.cameras[index].model, named.cameras[index].distortion) for index in examples
@@ -152,20 +152,22 @@ def read_with_photos(
         folder,
         ", undistorted" * bent + ", with masks" * masked,
         model,
-        len({*good} & {*held}),
+        len({*good} & {*held_out}),
         bytes_text(sum(sizes[index] for index in examples)),
     )
-    apart = [examples[i] for i in good if i in held]
     return dense, PosedPhotos(
-        views.resized(side), [examples[i] for i in good if i not in held], apart, model
+        views=views.resized(side),
+        training=[examples[index] for index in good if index not in held_out],
+        held_out=[examples[index] for index in good if index in held_out],
+        poses=model,
     )
 
 
 def held_out_psnrs(
     dense: Gaussians, results: Sequence[Gaussians], photos: Photos
 ) -> HeldOut | None:
-    """PSNR of results in held-out photos, and of the dense scene, which is on the device that
-    renders; None if there are no photos."""
+    """PSNR of results and of the dense scene in held-out photos, on the dense scene's device; None
+    if there are no photos."""
     if not photos:
         return None
     shown = spread_indices(len(photos), VIEW_COUNTS.compared)
@@ -179,8 +181,8 @@ def _usable(
     faults: dict[int, DataError],
     progress: Callable[[float], None] = lambda done: None,
 ) -> dict[int, _Read]:
-    """What is read for each index, by two threads, and in ``faults`` the errors of the others.
-    Raises the first error if most have one."""
+    """Read every index on two threads. Errors go to ``faults``; the first one is raised if most
+    indices fail."""
 
     def attempt(index: int) -> _Read | DataError:
         try:
@@ -210,7 +212,7 @@ def _usable(
 def _posed_files(
     folder: Path, poses: Path | str | None, scene: Path | None
 ) -> tuple[Path, NamedViews, dict[int, Path]]:
-    """A file of cameras, its cameras, and their photos by the indices of their views."""
+    """A camera file, its cameras, and their photos by view index."""
     names = photo_files(folder)
     places = [Path(poses)] if poses is not None else _camera_files(folder, scene)
     if not places:
@@ -229,7 +231,7 @@ def _posed_files(
             why = why or str(error)
             continue
         files = photos_of_cameras(folder, names, named)
-        if len(files) >= LEAST_PHOTOS:
+        if len(files) >= MIN_PHOTOS:
             if len(files) < len(named.names):
                 logger.info(
                     "%s: %d of its %d cameras have no photo in %s",
@@ -241,8 +243,8 @@ def _posed_files(
             return place, named, files
         why = why or (
             f"{place}: {len(files)} of its {len(named.names)} cameras have a photo in {folder}; "
-            "expected at least "
-            f"{LEAST_PHOTOS}. Names of cameras: {_two(named.names)}; of photos: {_two(names)}"
+            f"expected at least {MIN_PHOTOS}. Names of cameras: {_two(named.names)}; of photos: "
+            f"{_two(names)}"
         )
     raise DataError(why)
 
@@ -252,7 +254,7 @@ def _two(names: Sequence[str]) -> str:
 
 
 def _camera_files(folder: Path, scene: Path | None) -> list[Path]:
-    """Files of cameras in the folder of photos, above it, or beside the scene."""
+    """Camera files in the folder of photos, above it, or beside the scene."""
     places: list[Path] = []
     for above in (folder.absolute(), folder.absolute().parent):
         places += [
@@ -274,9 +276,9 @@ def _example(
 def _outliers(
     dense: Gaussians, examples: Mapping[int, Example], progress: Progress
 ) -> dict[int, float]:
-    """PSNR of the photos that fit much worse than the others, worst first: by 6 dB and by four
-    standard deviations, estimated from the median deviation. Of seven captures, two photos of one
-    are among them."""
+    """PSNR of outlier photos, worst first: below the median by 6 dB and by four standard
+    deviations, estimated from the median absolute deviation. Seven captures have two, both in one
+    capture."""
     drawn = thinned(dense, POSE_CHECK.max_count)
     psnrs = {}
     for done, (index, example) in enumerate(examples.items()):
@@ -286,9 +288,5 @@ def _outliers(
     middle = float(values.median())
     deviation = 1.4826 * float((values - middle).abs().median())
     bound = middle - max(6.0, 4 * deviation)
-    return dict(
-        sorted(
-            ((index, psnr) for index, psnr in psnrs.items() if psnr < bound),
-            key=lambda pair: pair[1],
-        )
-    )
+    outliers = [(index, psnr) for index, psnr in psnrs.items() if psnr < bound]
+    return dict(sorted(outliers, key=lambda pair: pair[1]))

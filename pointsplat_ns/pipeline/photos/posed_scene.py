@@ -1,5 +1,4 @@
-"""Reads a scene together with views from a file of cameras, and checks that both have the same
-frame."""
+"""Reads a scene with views from a camera file, and checks that both have the same frame."""
 
 from __future__ import annotations
 
@@ -25,18 +24,18 @@ from pointsplat_ns.system.files import logger
 
 
 def without_poses(poses: object) -> bool:
-    """Whether what stands for poses is :data:`NO_POSES`."""
+    """Whether ``poses`` is :data:`NO_POSES`."""
     return isinstance(poses, (str, Path)) and str(poses) == NO_POSES
 
 
 def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
-    """Views from a file of cameras that lies beside a scene's file or above it, see
-    :func:`~pointsplat_ns.scene.camera_files.camera_files_near`; None if there is none that belongs
-    to the scene.
+    """Views from a camera file beside a scene's file or above it, see
+    :func:`~pointsplat_ns.scene.camera_files.camera_files_near`; None if no camera file belongs to
+    the scene.
 
-    The file is named in one line. It counts if the views show the scene sharp, and either a
-    training wrote its poses in the scene's frame, or ``dataparser_transforms.json`` moves them.
-    Nobody asked for it, so no photo that it names is opened.
+    The file is logged in one line. It is used if its views show the scene sharp, and its poses are
+    in the scene's frame: written by the training, or moved by ``dataparser_transforms.json``. The
+    user did not name the file, so its photos are not opened.
     """
     for place in camera_files_near(path):
         try:
@@ -45,20 +44,19 @@ def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
                 found.check(scene, photos=False)
                 logger.info("poses: %s; --poses none samples views instead", place)
                 return found
-            why = f"its frame may be another one; --poses {place} compares its photos and takes it"
+            reason = f"its frame may differ; --poses {place} uses it after comparing its photos"
         except (DataError, SceneError) as error:
-            why = str(error)
-        logger.info("%s: not used for views: %s", place, why)
+            reason = str(error)
+        logger.info("%s: not used for views: %s", place, reason)
     return None
 
 
-def read_found(
+def read_scene_and_cameras(
     scene: Gaussians | Path | str, poses: Path | str | None
 ) -> tuple[Gaussians, Views | None, Path | None]:
-    """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of
-    that file. A given one is read before the scene; then both are checked against each other.
-    Errors are those of :meth:`PosesFile.of`, :func:`~pointsplat_ns.scene.read_scene` and
-    :meth:`PosesFile.check`."""
+    """Read a scene, views from a given or nearby camera file, and the path of that file. A given
+    file is read before the scene, then checked against it. Raises the errors of
+    :meth:`PosesFile.of`, :func:`~pointsplat_ns.scene.read_scene` and :meth:`PosesFile.check`."""
     if poses is not None and not without_poses(poses):
         given = PosesFile.of(scene, poses)
         dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
@@ -76,23 +74,23 @@ def read_found(
 
 @dataclass(frozen=True, eq=False)
 class PosesFile:
-    """Views of a scene from a file of cameras."""
+    """Views of a scene from a camera file."""
 
     path: Path
     views: Views
-    """In the frame of the scene's file, or relative to its offset; of at most 1600 pixels on the
+    """Views in the frame of the scene's file, or relative to its offset; at most 1600 pixels on the
     longer side, as in 3DGS training."""
     named: NamedViews
     transforms: Path | None
-    """What moved them into the frame of the scene, unless the file's frame is no dataset's."""
+    """File with the transform from the dataset's frame to the scene's; None if there is none."""
 
     @staticmethod
     def of(scene: Gaussians | Path | str, poses: Path | str) -> PosesFile:
-        """Read the views of a scene from a file of cameras.
+        """Read the views of a scene from a camera file.
 
         A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses
-        moves them into the scene's frame. Raises SceneError if a file is missing, or the transforms
-        are not usable, and DataError if the file has no usable cameras.
+        moves views into the scene's frame. Raises SceneError if a file is missing or the transforms
+        are unusable, and DataError if there is no usable camera.
         """
         transforms = None if isinstance(scene, Gaussians) else _transforms_of(Path(scene))
         transforms = transforms or transforms_beside(poses)
@@ -100,29 +98,29 @@ class PosesFile:
         return PosesFile(Path(poses), named.views.resized(1600), named, transforms)
 
     def relative_to(self, offset: tuple[float, float, float] | None) -> PosesFile:
-        """The same for a scene whose positions are relative to an offset, scene units."""
+        """The same with views relative to a scene's offset, scene units."""
         return replace(self, views=self.views.relative_to(offset))
 
     def check(self, scene: Gaussians, photos: bool = True) -> None:
-        """Check by small renders, and, if ``photos``, by the photos that lie where the file says,
-        that the views belong to a scene, to whose offset they are relative.
+        """Check that the views, relative to the scene's offset, belong to a scene: by small renders
+        and, if ``photos``, by photos at the paths in the file.
 
         Raises:
-            DataError: if most views show nothing of the scene, or nothing sharp, or renders are not
-                like the photos. A scene without a visible Gaussian is not refused here.
+            DataError: if most views show nothing of the scene or nothing sharp, or renders do not
+                match the photos. An invisible scene passes.
         """
         faults = pose_faults(scene, self.views)
         like = None if faults.serious or not photos else likeness(scene, self._photos())
         if not faults.serious and (like is None or like.enough):
             return
         mend = (
-            "nerfstudio moves and scales scenes, and its run says how in "
-            "dataparser_transforms.json; put that file beside the scene, or write the scene in the "
-            "frame of its data (pointsplat convert RUN --original-frame)"
+            "nerfstudio moves and scales scenes; put dataparser_transforms.json of its run beside "
+            "the scene, or write the scene in the frame of its data (pointsplat convert RUN "
+            "--original-frame)"
         )
         if self.transforms is not None:
             mend = (
-                f"{self.transforms} is of another run, or the scene was moved since its training; "
+                f"{self.transforms} belongs to another run, or the scene was moved since training; "
                 "write the scene again from its run"
             )
         raise DataError(
@@ -131,25 +129,25 @@ class PosesFile:
         )
 
     def _photos(self) -> list[Photo]:
-        """Photos of some of the views, those that lie where the file says and have the shape of
-        their picture."""
+        """Photos of some views, if they exist at the paths in the file and have the view's aspect
+        ratio."""
         found: list[Photo] = []
         for index in spread_indices(len(self.views), POSE_CHECK.views):
             file = self.named.photo(index)
             view = self.views[index]
             photo = None if file is None else read_reduced(file, POSE_CHECK.side)
-            # One of another shape is cut, or turned by EXIF.
-            if (
-                photo is not None
-                and abs(photo.shape[1] * view.height / (photo.shape[0] * view.width) - 1) < 0.05
-            ):
+            if photo is None:
+                continue
+            # Another aspect ratio means that the photo is cropped, or rotated by EXIF.
+            aspect_ratio = photo.shape[1] * view.height / (photo.shape[0] * view.width)
+            if abs(aspect_ratio - 1) < 0.05:
                 found.append((view, photo, None))
         return found
 
 
 def check_photos(scene: Gaussians, photos: Sequence[Photo], data: Path | str) -> None:
-    """Raise a DataError if renders of a scene are not like the photos of its training, a few of
-    which are read; ``data`` is the path of these."""
+    """Raise a DataError if renders of a scene do not match a few of its training photos; ``data``
+    is their path."""
     some = [photos[index] for index in spread_indices(len(photos), POSE_CHECK.views)]
     like = likeness(scene, some)
     if not like.enough:
@@ -160,7 +158,7 @@ def check_photos(scene: Gaussians, photos: Sequence[Photo], data: Path | str) ->
 
 
 def _transforms_of(scene: Path) -> Path | None:
-    """The ``dataparser_transforms.json`` of the scene's run, or beside its file."""
+    """The ``dataparser_transforms.json`` in the scene's run, or beside its file."""
     folder = scene if scene.is_dir() else scene.parent
     if scene.suffix == ".ckpt" and not (folder / RUN_FILES.config).is_file():
         folder = folder.parent

@@ -1,1 +1,1 @@
-"""Levels of detail: smaller scenes of one scene, in a folder or as a stream."""
+"""Levels of detail: smaller versions of a scene, as a folder, stream, tiles or paged file."""

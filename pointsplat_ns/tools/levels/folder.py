@@ -1,4 +1,4 @@
-"""The folder of written levels of detail: a PLY of each level, and a manifest."""
+"""Writes levels of detail to a folder: a PLY per level, and a manifest."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.system.files import content_hash, replacing_folder, write_json
 
 OWN_FILES = rf"{re.escape(FOLDER_FILES.levels)}|level_\d+\.ply"
-"""Pattern of the names of files in the folder."""
+"""Pattern of file names in the folder."""
 
 
 def check_folder(folder: Path, names: Iterable[str], force: bool) -> None:
-    """Raise a SceneError, before the long computations, if files may not be written to a folder: it
-    is a file or named like one, or holds one of these files, which must not be overwritten."""
+    """Raise a SceneError, before long computations, if ``folder`` is a file or named like one, or
+    contains one of the files ``names``, unless ``force``."""
     if folder.suffix.lower() in (".ply", ".sog", ".json", ".png", ".rad") or (
         folder.exists() and not folder.is_dir()
     ):
@@ -39,15 +39,15 @@ def write_levels(
     facts: Sequence[dict[str, Any]],
     force: bool = False,
 ) -> None:
-    """Write all levels and their manifest, or nothing.
+    """Write all levels and the manifest, or nothing.
 
-    All files are written beside before the first replaces an older one, see
+    All files are complete before the first replaces an older one, see
     :func:`~pointsplat_ns.system.files.replacing_folder`.
 
     Args:
         folder: created if it is missing.
-        levels: their scenes.
-        about, facts: the manifest's facts on all levels together, and on each.
+        levels: scenes of the levels, the finest first.
+        about, facts: entries of the manifest on all levels together, and on each level.
         force: whether existing files may be overwritten.
 
     Raises:
@@ -70,5 +70,5 @@ def write_levels(
 
 
 def level_names(count: int) -> list[str]:
-    """Names of the files of a number of levels: the manifest, then a PLY of each."""
+    """File names of ``count`` levels: the manifest, then a PLY per level."""
     return [FOLDER_FILES.levels, *(f"level_{index}.ply" for index in range(count))]

@@ -1,5 +1,4 @@
-"""The distance from which on a level of detail shows enough, by its renders in near and farther
-views."""
+"""Finds the distance at which a level of detail suffices, from renders in near and far views."""
 
 from __future__ import annotations
 
@@ -15,21 +14,19 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.tensors import DOUBLES
 
 ENOUGH = 30.0
-"""PSNR in dB against the dense scene from which on a level is taken to show as much, see
-:func:`pixel_size_for`."""
+"""PSNR against the dense scene at which a level suffices, dB; see :func:`pixel_size_for`."""
 
 
 def pixel_sizes(
     dense: Gaussians, reference: Reference, levels: Sequence[Gaussians], near: Sequence[float]
 ) -> list[float] | None:
-    """Scene units a pixel from which on each level shows enough; None if the dense scene covers no
-    pixel.
+    """Scene units per pixel at which each level suffices; None if the dense scene covers no pixel.
 
     Args:
-        dense: the scene that the levels were made of.
-        reference: its renders.
-        levels: their scenes.
-        near: PSNR of each in the views that every command judges in, dB.
+        dense: the scene of the levels.
+        reference: renders of the dense scene.
+        levels: scenes of the levels.
+        near: PSNR of each level in the views of the judge, dB.
     """
     distance = median_depth(dense, reference)
     if distance is None:
@@ -46,16 +43,16 @@ def pixel_sizes(
 
 
 def pixel_size_for(psnrs: dict[int, float], whole: dict[int, float], pixel_size: float) -> float:
-    """Scene units a pixel from which on a level shows enough: its PSNR is :data:`ENOUGH`, or that
-    of the dense scene where this is lower.
+    """Scene units per pixel at which a level suffices: its PSNR reaches :data:`ENOUGH`, or the PSNR
+    of the dense scene if that is lower.
 
-    A line through the measured differences over the logarithm of the distance crosses zero there,
-    from an eighth of the compared distance to 64 times it.
+    There, a line through the measured differences over the logarithm of the distance crosses zero.
+    The result is between an eighth of the compared distance and 64 times it.
 
     Args:
-        psnrs: PSNR in dB of the level, by multiple of the distance.
-        whole: the same of the dense scene itself.
-        pixel_size: of the compared views at the median depth, scene units.
+        psnrs: PSNR of the level by multiple of the distance, dB.
+        whole: the same of the dense scene.
+        pixel_size: pixel size of the compared views at the median depth, scene units.
     """
     short = [
         min(psnr, 99.0) - min(ENOUGH, whole.get(times, ENOUGH)) for times, psnr in psnrs.items()
@@ -63,23 +60,22 @@ def pixel_size_for(psnrs: dict[int, float], whole: dict[int, float], pixel_size:
     doublings = torch.tensor([*psnrs], **DOUBLES).log2()
     gap = torch.tensor(short, **DOUBLES)
     about = doublings - doublings.mean()
-    slope = max(
-        float((about @ gap) / about.square().sum().clamp_min(1e-9)), 1.0
-    )  # dB each time twice as far
+    # dB per doubling of the distance
+    slope = max(float((about @ gap) / about.square().sum().clamp_min(1e-9)), 1.0)
     return pixel_size * 2.0 ** min(max(float(doublings.mean() - gap.mean() / slope), -3.0), 6.0)
 
 
 def far_references(reference: Reference) -> dict[int, Reference]:
-    """Target images at each multiple of the distance (2, 4, 8), as far as the compared views have
-    enough pixels.
+    """Target images at multiples of the distance (2, 4, 8), while the compared views have enough
+    pixels.
 
-    The scene covers a smaller part of the picture there, so a target is a near render with each
-    square of ``times`` x ``times`` pixels averaged. The dense scene itself does not reach inf: the
-    rasterizer draws Gaussians no thinner than a pixel, so its distant renders are coarser than the
-    targets. A level can be closer to the targets than the dense scene.
+    From farther away, the scene covers a smaller part of the picture. A target is therefore a near
+    render, averaged over squares of ``times`` x ``times`` pixels. Even the dense scene has a finite
+    PSNR: the rasterizer draws no Gaussian thinner than a pixel, so its distant renders are coarser
+    than the targets. A level can be closer to the targets than the dense scene.
     """
     views = reference.views
-    found = {}
+    references = {}
     for times in (2, 4, 8):
         if times > min(views.width, views.height):
             continue
@@ -91,14 +87,14 @@ def far_references(reference: Reference) -> dict[int, Reference]:
             avg_pool2d(image.double().permute(2, 0, 1), times).permute(1, 2, 0)
             for image in reference.renders
         ]
-        found[times] = Reference(smaller, targets, reference.covered)
-    return found
+        references[times] = Reference(smaller, targets, reference.covered)
+    return references
 
 
 @torch.no_grad()
 def median_depth(dense: Gaussians, reference: Reference) -> float | None:
-    """The median depth over the covered pixels of the compared views, scene units; None if no pixel
-    is covered."""
+    """Median depth over the covered pixels of the compared views, scene units; None if there is
+    none."""
     depths = []
     for view in replace(reference.views, rasterize_mode="classic").resized(100):
         depth, alpha = render_depth(dense, view)

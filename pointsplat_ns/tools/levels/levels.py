@@ -1,8 +1,8 @@
-"""Levels of detail: a scene merged to ever fewer Gaussians in one pass, with the error of each
+"""Makes levels of detail: merges a scene to ever fewer Gaussians in one pass, and measures each
 level.
 
-Each level is merged from the level before, so levels are nested: every Gaussian has one parent in
-the next coarser level. A repair moves the Gaussians of a level, and keeps their parents.
+Each level is merged from the previous one, so levels are nested: every Gaussian has one parent in
+the next coarser level. A repair moves the Gaussians of a level, but not their parents.
 """
 
 from __future__ import annotations
@@ -54,21 +54,20 @@ class Level:
 
     scene: Gaussians
     """K Gaussians."""
-    assignment: (
-        Tensor  # [N] int64, index in ``scene`` for each Gaussian of the dense scene; -1 if dropped
-    )
+    assignment: Tensor
+    """[N] int64, index in ``scene`` for each Gaussian of the dense scene; -1 if dropped."""
     dropped: int
-    """Number of Gaussians of the dense scene without a place in this level, because they are too
-    faint to be drawn."""
+    """Number of Gaussians of the dense scene missing from this level, because they are too faint to
+    draw."""
     quality: Quality | None
-    """How close its renders are to the dense scene's; None if there is no view."""
+    """Quality against the dense scene; None if there is no view."""
     seconds: float
-    """Duration of merging from the level before, and of the repair."""
+    """Duration of merging from the previous level, and of the repair."""
     repair: StageResult | None = None
-    """The repair of the level, kept or not; None if there was none."""
+    """Repair of the level, accepted or not; None if there was none."""
 
     def facts(self, whole: int) -> dict[str, Any]:
-        """The manifest's entry of the level; ``whole`` is the number of Gaussians of the dense
+        """Entry of the level in the manifest; ``whole`` is the number of Gaussians of the dense
         scene."""
         near = self.quality
         return {
@@ -86,8 +85,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels of detail of a scene. ``len``, indices and iteration give each :class:`Level`, the
-    finest first.
+    """Levels of detail of a scene: a sequence of :class:`Level`, the finest first.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -100,19 +98,19 @@ class Levels:
     """
 
     dense: Gaussians
-    """The N Gaussians of the dense scene with all SH bands, without undrawable ones."""
+    """N drawable Gaussians of the dense scene, with all SH bands."""
     levels: tuple[Level, ...]
-    """The finest first."""
+    """The levels, the finest first."""
     views: Views | None
-    """The views that tell from which distance on a level shows enough; None if there are none."""
+    """Views that decide at which distance a level suffices; None if there are none."""
     origin: ViewOrigin | None
-    """Where the views came from."""
+    """Origin of the views."""
     source: SourceFile | None
-    """The file of the dense scene; None if it was given as Gaussians."""
+    """File of the dense scene; None for Gaussians in memory."""
     notes: tuple[str, ...]
-    """Lines of text: SH bands dropped, origin of the views, why nothing was compared."""
+    """Lines of text: origin of the views, cut SH bands, repairs, errors of the comparison."""
     judge: Judge | None
-    """Judges the levels; None if there are no views."""
+    """Judge of the levels; None if there are no views."""
 
     @property
     def scenes(self) -> list[Gaussians]:
@@ -121,22 +119,22 @@ class Levels:
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C ended a repair early; levels after it are not repaired."""
+        """Whether Ctrl-C ended a repair early; later levels are not repaired."""
         return any(level.repair is not None and level.repair.interrupted for level in self)
 
     @property
     def parents(self) -> list[Tensor]:
-        """For each level but the last, the index (M,) int64 in the next of the parent of each
-        Gaussian; -1 if it is dropped."""
-        found = []
+        """Parents of all levels but the last: index (M,) int64 in the next level for each Gaussian;
+        -1 if it is dropped."""
+        all_parents = []
         for finer, coarser in zip(self.levels, self.levels[1:], strict=False):
             parents = torch.full(
                 (len(finer.scene),), -1, dtype=torch.int64, device=finer.assignment.device
             )
-            kept = finer.assignment >= 0
-            parents[finer.assignment[kept]] = coarser.assignment[kept]
-            found.append(parents)
-        return found
+            present = finer.assignment >= 0
+            parents[finer.assignment[present]] = coarser.assignment[present]
+            all_parents.append(parents)
+        return all_parents
 
     def __len__(self) -> int:
         return len(self.levels)
@@ -155,21 +153,22 @@ class Levels:
             force: overwrite existing files.
 
         Raises:
-            SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
+            SceneError: if the folder is not usable, or contains a file that must not be
+                overwritten.
         """
         dense = self.dense
         file = self.source
-        of = self.views
+        views = self.views
         boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
         if (content := content_box(dense)) is not None:
             boxes["content"] = content
-        views = None
-        if of is not None:
-            views = {
-                "count": len(of),
+        about_views = None
+        if views is not None:
+            about_views = {
+                "count": len(views),
                 "origin": origin_text(self.origin),
-                "width": of.width,
-                "height": of.height,
+                "width": views.width,
+                "height": views.height,
             }
         source = {
             "file": file and file.name,
@@ -181,32 +180,31 @@ class Levels:
         bounds = {
             name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()
         }
-        about = {"source": source, "bounds": bounds, "views": views}
+        about = {"source": source, "bounds": bounds, "views": about_views}
         write_levels(folder, self.scenes, about, [level.facts(len(dense)) for level in self], force)
 
     def pixel_sizes(self) -> list[float]:
-        """Scene units a pixel from which on each level shows enough; without views, the typical
-        size of its Gaussians."""
+        """Scene units per pixel at which each level suffices; without views, the typical size of
+        its Gaussians."""
         near = [level.quality.psnr for level in self if level.quality is not None]
-        found = None
+        sizes = None
         if self.views is not None:
-            found = pixel_sizes(
+            sizes = pixel_sizes(
                 self.dense, DenseReference(self.dense, self.views), self.scenes, near
             )
-        return found or [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
+        return sizes or [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
 
 
 @dataclass(frozen=True)
 class LevelOutput:
-    """Where levels are written, and in which form. Raises PointSplatError if options do not fit
-    each other."""
+    """Path and form of the output of levels."""
 
     path: Path
-    """A folder; of the form "paged" a file."""
+    """A folder; for the form "paged" a file."""
     form: Literal["folder", "stream", "tiles", "paged"]
-    """A folder with a file for each level, a streamed SOG, 3D Tiles, or a RAD file."""
+    """A folder with a PLY per level, a streamed SOG, 3D Tiles, or a RAD file."""
     at: str | None
-    """Where the scene lies on the Earth, for tiles."""
+    """Place of the scene on the Earth, for tiles."""
     up: str | None
     force: bool
 
@@ -220,10 +218,11 @@ class LevelOutput:
         up: str | None,
         force: bool,
     ) -> LevelOutput | None:
-        """The output of options of :func:`pointsplat_ns.lod`; None if nothing is written."""
+        """The output from options of :func:`pointsplat_ns.lod`; None if nothing is written. Raises
+        PointSplatError if options contradict each other."""
         if stream and tiles or at is not None and not tiles:
             raise PointSplatError(
-                "expected either a stream or 3D Tiles, and a place on the Earth with tiles alone"
+                "expected either a stream or 3D Tiles; a place on the Earth needs tiles"
             )
         if at is not None:
             Place.parse(at)
@@ -239,20 +238,18 @@ class LevelOutput:
         )
 
     def check(self, count: int) -> None:
-        """Check that ``count`` levels can be written."""
+        """Check that ``count`` levels can be written. Raises SceneError."""
         if self.form == "paged":
             return need_writable(self.path, self.force)
-        names = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}[
-            self.form
-        ]
+        written = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}
         need_folder(self.path)
         if not self.force:
             claim(self.path)
-        check_folder(self.path, names, self.force)
+        check_folder(self.path, written[self.form], self.force)
 
     def write(self, levels: Levels, progress: Progress) -> Levels:
-        """Write levels; those of a stream are then judged as they are in its files."""
-        self.check(len(levels))  # again: a file may have appeared meanwhile
+        """Write levels. Levels of a stream are then judged as stored in its files."""
+        self.check(len(levels))  # again, because a file may have appeared meanwhile
         if self.form == "folder":
             levels.save(self.path, self.force)
         elif self.form == "paged":
@@ -278,9 +275,11 @@ class LevelOutput:
 
 
 def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
-    """The text and the budget of each level, checked as far as that is possible without the scene:
-    ratios, percentages, counts and sizes as for ``keep``; a text may hold several, separated by
-    spaces. Raises BudgetError if there is none, or a level is not a budget or needs a search."""
+    """Text and budget of each level, checked as far as possible without the scene.
+
+    Budgets are ratios, percentages, counts and sizes, as for ``keep``. A single text may contain
+    several, separated by spaces. Raises BudgetError if there is none, or a level is not a budget or
+    needs a search."""
     levels = levels.split() if isinstance(levels, str) else levels
     if not levels:
         raise BudgetError("no level given; expected at least one, such as 50%")
@@ -303,8 +302,8 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
 def level_counts(
     levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits: Traits
 ) -> list[int]:
-    """The number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if
-    a level does not fit the scene, or two levels have the same number."""
+    """Number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if a
+    level does not fit the scene, or two levels have the same number."""
     texts: dict[int, str] = {}
     for text, budget in levels:
         try:
@@ -313,8 +312,8 @@ def level_counts(
             raise BudgetError(f"level {text}: {error}") from error
         if count in texts:
             raise BudgetError(
-                f"levels {texts[count]} and {text} both mean {count} of {n} Gaussians; leave one "
-                "out"
+                f"levels {texts[count]} and {text} both mean {count} of {n} Gaussians; expected "
+                "different counts"
             )
         texts[count] = text
     return sorted(texts, reverse=True)
@@ -329,18 +328,17 @@ def make_levels(
     progress: Progress,
     budget: RepairBudget,
 ) -> Levels:
-    """Make levels of detail in one pass, and measure each level as soon as it is made.
+    """Make levels of detail in one pass, and measure each level.
 
     Args:
-        dense: N Gaussians. Undrawable ones are left out first, and their number is logged.
-        levels: of :func:`parse_levels`; in any order.
-        options: for all Gaussians; their SH bands are those of every level.
-        views: source of the views to compare renders in; merging uses them too where they are
-            known.
+        dense: N Gaussians. Undrawable ones are dropped first, and their number is logged.
+        levels: levels from :func:`parse_levels`, in any order.
+        options: SH bands of every level.
+        views: source of views for comparison; merging uses known views too.
         source: the file of ``dense``, for the manifest.
         progress: called with the name of the current task and the share of it that is done, in [0,
             1].
-        budget: of the repair of each level. Levels are merged from unrepaired ones.
+        budget: length of the repair of each level. Levels are merged from unrepaired ones.
 
     Raises:
         BudgetError: if a level does not fit the scene, or two levels have the same number of
@@ -360,32 +358,34 @@ def make_levels(
         judge = Judge(dense, views)
         compared = views.compared()
     except DataError as error:
-        notes = (*notes, f"the levels' errors are not measured: {error}")
+        notes = (*notes, f"errors of the levels are not measured: {error}")
     if views.origin is not None:
         notes = (f"views: {origin_text(views.origin)}", *notes)
     repair = Repair(budget)
     repairing = judge is not None and not budget.empty
-    at_work = dense.to(default_device()) if repairing else dense
-    comparison = Comparison(at_work, views) if repairing else None
+    dense_on_device = dense.to(default_device()) if repairing else dense
+    comparison = Comparison(dense_on_device, views) if repairing else None
     made: list[Level] = []
     start = time.perf_counter()
     for merged in merge_levels(
         cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()
     ):
-        which = f"level {len(made)}"
+        name = f"level {len(made)}"
         scene = merged.scene
         repaired = None
         if comparison is not None and len(scene) < len(cut.scene):
-            before = comparison.reference.closeness(scene.to(at_work.device))
+            before = comparison.reference.closeness(scene.to(dense_on_device.device))
             merge = StageResult("merge", scene, before)
             if repair.applies(merge):
-                context = Context(at_work, views, comparison, progress=within(which, progress))
+                context = Context(
+                    dense_on_device, views, comparison, progress=within(name, progress)
+                )
                 repaired = repair.run(merge, context)
                 scene = repaired.scene if repaired.accepted else scene
-                notes = (*notes, f"{which}: {stage_text(repaired)}")
+                notes = (*notes, f"{name}: {stage_text(repaired)}")
                 comparison = None if repaired.interrupted else comparison
         seconds = time.perf_counter() - start
-        progress(f"judging {which} of {len(counts) - 1}", 0.0)
+        progress(f"judging {name} of {len(counts) - 1}", 0.0)
         quality = None if judge is None else judge.quality(scene)
         dropped = int((merged.assignment < 0).sum())
         made.append(Level(scene, merged.assignment, dropped, quality, seconds, repaired))

@@ -1,4 +1,4 @@
-"""Levels of detail as a RAD file: a tree of all Gaussians of all levels, from one root on."""
+"""Writes levels of detail as a RAD file: a tree of the Gaussians of all levels with one root."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def write_paged(
     parents: Sequence[Tensor],
     progress: Progress = silent,
 ) -> int:
-    """Write levels of detail as a RAD file. The coarsest is merged on to one Gaussian.
+    """Write levels of detail as a RAD file. The coarsest level is merged further, to one Gaussian.
 
     Args:
         path: the file.
-        levels, parents, progress: as of :func:`~pointsplat_ns.tools.levels.tiles_3d.write_tiles`.
+        levels, parents, progress: as for :func:`~pointsplat_ns.tools.levels.tiles_3d.write_tiles`.
 
     Returns:
         The number of Gaussians written.

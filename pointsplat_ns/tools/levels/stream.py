@@ -1,7 +1,7 @@
-"""Levels of detail as a streamed SOG: which part of which level is a leaf of its tree.
+"""Writes levels of detail as a streamed SOG, and divides the levels into leaves of its tree.
 
-Levels are nested, so a leaf holds the same part of the scene in every level: the descendants of
-Gaussians of the coarsest one. Where two leaves of different levels meet, nothing is drawn twice and
+Levels are nested, so a leaf has the same part of the scene in every level: the descendants of some
+Gaussians of the coarsest level. Where leaves of different levels meet, nothing is drawn twice and
 nothing is missing.
 """
 
@@ -34,11 +34,11 @@ def write_stream(
 
     Args:
         folder: created if it is missing.
-        levels, parents, progress, force: as of
+        levels, parents, progress, force: as for
             :func:`~pointsplat_ns.tools.levels.tiles_3d.write_tiles`.
 
     Returns:
-        The number of Gaussians written of each level.
+        The number of written Gaussians per level.
 
     Raises:
         SceneError: if a file cannot be written.
@@ -58,24 +58,23 @@ def partition(
     extent: float | None = None,
     least: int = 8192,
 ) -> Node:
-    """A tree whose leaves hold the descendants of neighbours in the coarsest level, in Morton
+    """A tree whose leaves contain the descendants of neighbours in the coarsest level, in Morton
     order.
 
     Args:
-        levels, parents: as of :func:`write_stream`.
-        most: Gaussians of the finest level in a leaf, at most.
-        extent: largest side of a leaf, scene units; by default an eighth of the diagonal of the
+        levels, parents: as for :func:`write_stream`.
+        most: maximum number of Gaussians of the finest level in a leaf.
+        extent: maximum side of a leaf, scene units; by default an eighth of the diagonal of the
             content.
-        least: Gaussians of the finest level in a leaf, up to which it is not cut for its extent.
-            The tree has one entry for a leaf, and viewers choose a level for each, so that leaves
-            of few Gaussians cost more than they save.
+        least: number of Gaussians of the finest level up to which a leaf is not cut for its extent.
+            Viewers choose a level per leaf, so leaves of few Gaussians cost more than they save.
     """
     coarsest = levels[-1]
     ancestors = [torch.arange(len(coarsest), **INDICES)]
     for of in reversed(parents):
         ancestors.insert(0, torch.where(of >= 0, ancestors[0][of.clamp_min(0)], -1))
-    kept = ancestors[0] >= 0
-    weights = torch.bincount(ancestors[0][kept], minlength=len(coarsest))
+    present = ancestors[0] >= 0
+    weights = torch.bincount(ancestors[0][present], minlength=len(coarsest))
     extent = content_size(coarsest)[1] / 8 if extent is None else extent
     parts = halved(coarsest.means, weights, most, extent, least)
     members = leaves(parts)
@@ -89,10 +88,8 @@ def partition(
     filled = iter(Node(rows=leaf) for leaf in zip(*rows, strict=True))
 
     def node(part: Parts) -> Node:
-        return (
-            next(filled)
-            if isinstance(part, Tensor)
-            else Node(children=(node(part[0]), node(part[1])))
-        )
+        if isinstance(part, Tensor):
+            return next(filled)
+        return Node(children=(node(part[0]), node(part[1])))
 
     return node(parts)

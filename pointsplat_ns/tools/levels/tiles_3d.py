@@ -1,4 +1,4 @@
-"""Levels of detail as 3D Tiles: a tree of cells, which a viewer refines where it needs more."""
+"""Writes levels of detail as 3D Tiles: a tree of cells, which a viewer refines on demand."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from pointsplat_ns.view_sampling.sampler import Sampler
 from pointsplat_ns.view_sampling.upright import known_up, up_named
 
 TILESET = "tileset.json"
-"""The file that tells of all others."""
+"""Name of the index file."""
 
 
 def placed(
     levels: Sequence[Gaussians], dense: Gaussians, at: str | None, up: str | None
 ) -> tuple[list[Gaussians], Tensor]:
-    """Levels, float32 on the CPU, about the middle of the coarsest, and the matrix (4, 4) float64
-    from there to the frame of tiles: that of the scene's file, or the Earth's.
+    """Levels centred on the middle of the coarsest, float32 on the CPU, and the matrix (4, 4)
+    float64 to the frame of the tiles: the frame of the scene's file, or of the Earth.
 
     Args:
         levels: the finest first.
-        dense: the scene that they were made of.
-        at: where it lies, see :meth:`~pointsplat_ns.geometry.earth.Place.parse`; None for the frame
-            of its file.
-        up: the axis that is up, if ``at`` is a point; by default the scene's own, or estimated.
+        dense: the scene of the levels.
+        at: place on the Earth, see :meth:`~pointsplat_ns.geometry.earth.Place.parse`; None for the
+            frame of the scene's file.
+        up: up axis if ``at`` is a point; by default declared by the scene, or estimated.
     """
     scenes = [scene.detach().to("cpu", torch.float32) for scene in levels]
     middle = from_centre(scenes[-1]).offset or (0.0, 0.0, 0.0)
@@ -70,32 +70,31 @@ def write_tiles(
     most: int = 1 << 16,
     force: bool = True,
 ) -> list[int]:
-    """Write levels of detail as 3D Tiles of glTF with SPZ, which CesiumJS draws: all of them, or
-    nothing.
+    """Write levels of detail as 3D Tiles of glTF with SPZ, for CesiumJS: all of them, or nothing.
 
-    All files are written beside before the first replaces an older one, see
+    All files are complete before the first replaces an older one, see
     :func:`~pointsplat_ns.system.files.replacing_folder`.
 
     Args:
         folder: created if it is missing.
         levels: the finest first, float32 on the CPU; z is up.
-        parents: for each level but the last, the index (M,) in the next of the parent of each
-            Gaussian; -1 for those that are too faint to be drawn, which are left out.
-        pixel_sizes: of each level, scene units a pixel from which on it shows enough.
+        parents: for all levels but the last, index (M,) of each Gaussian's parent in the next
+            level; -1 for Gaussians too faint to draw, which are dropped.
+        pixel_sizes: scene units per pixel at which each level suffices.
         matrix: (4, 4) float64, from the levels' frame to that of the tiles.
         progress: called while encoding.
-        most: Gaussians in a tile, but for children of one parent.
+        most: maximum number of Gaussians in a tile; children of one parent stay together.
         force: whether existing files may be replaced.
 
     Returns:
-        The number of Gaussians written of each level.
+        The number of written Gaussians per level.
 
     Raises:
         SceneError: if a file cannot be written.
     """
     warn_of_losses(format_to_write(".spz"), levels[0], folder)
     tops = cells(levels, parents, most)
-    # CesiumJS refines a tile at an error of 16 pixels, by default
+    # By default, CesiumJS refines a tile at an error of 16 pixels.
     errors = [16.0 * size for size in itertools.accumulate(pixel_sizes, max)]
     counts = [0] * len(levels)
     number = itertools.count()
@@ -115,8 +114,8 @@ def write_tiles(
         error = errors[cell.level] if children else 0.0
         return {**_node(torch.stack([low, high]), children, error), "content": {"uri": name}}
 
-    ours = rf"{re.escape(TILESET)}|tiles"
-    with replacing_folder(folder, TILESET, ours, force) as beside:
+    own_files = rf"{re.escape(TILESET)}|tiles"
+    with replacing_folder(folder, TILESET, own_files, force) as beside:
         root = _node(None, [tile(top) for top in tops], max(errors))
         root["geometricError"] = max(
             root["geometricError"], 2 * sum(root["boundingVolume"]["box"][3::4])
@@ -136,17 +135,16 @@ def write_tiles(
 
 
 def _box(scene: Gaussians) -> tuple[Tensor, Tensor]:
-    """The corners of the box of all centres and of three times the middle size about them. That of
-    the largest Gaussians would be so large that viewers would refine what is far away."""
+    """Corners of the box of all means, with a margin of three times the median size. A box of the
+    largest Gaussians would make viewers refine distant tiles."""
     margin = 3 * typical_sizes(scene).median()
     return scene.means.double().amin(dim=0) - margin, scene.means.double().amax(dim=0) + margin
 
 
 def _node(corners: Tensor | None, children: list[dict[str, Any]], error: float) -> dict[str, Any]:
-    """A tile without content, with the box of its own corners (2, 3) and those of its children."""
-    boxes = torch.tensor([child["boundingVolume"]["box"] for child in children], **DOUBLES).reshape(
-        -1, 12
-    )
+    """A tile without content, with the box around its own corners (2, 3) and its children."""
+    child_boxes = [child["boundingVolume"]["box"] for child in children]
+    boxes = torch.tensor(child_boxes, **DOUBLES).reshape(-1, 12)
     middle = boxes[:, :3]
     half = boxes[:, 3::4]
     points = torch.cat([middle - half, middle + half, *([] if corners is None else [corners])])

@@ -1,5 +1,4 @@
-"""Cells of nested levels: parts of a scene that hold the descendants of neighbours in a coarser
-level."""
+"""Divides nested levels into cells: the descendants of neighbours in a coarser level."""
 
 from __future__ import annotations
 
@@ -21,11 +20,10 @@ Parts: TypeAlias = "Tensor | tuple[Parts, Parts]"
 
 @dataclass(eq=False)
 class Cell:
-    """A part of one level; the finer level's part in the same place is that of its children
-    together."""
+    """A part of one level. Its children together are the same part of the next finer level."""
 
     level: int
-    """0 is the finest."""
+    """Index of the level; 0 is the finest."""
     rows: Tensor
     """Indices of Gaussians of the level, in Morton order."""
     children: list[Cell] = field(default_factory=list)
@@ -34,8 +32,7 @@ class Cell:
 def halved(
     points: Tensor, weights: Tensor, most: int, extent: float = math.inf, least: int = 0
 ) -> Parts:
-    """Points (N, 3) cut at the middle of their weight (N,) along their longest side, again and
-    again.
+    """Cut points (N, 3) recursively at the middle of their weight (N,) along the longest side.
 
     A part is cut if it has more than one point, and a larger weight than ``most``, or a side longer
     than ``extent`` and a larger weight than ``least``.
@@ -58,14 +55,15 @@ def halved(
 
 
 def leaves(parts: Parts) -> list[Tensor]:
-    """The parts that are not cut, in order."""
-    return (
-        [parts] if isinstance(parts, Tensor) else [leaf for part in parts for leaf in leaves(part)]
-    )
+    """The uncut parts, in order."""
+    if isinstance(parts, Tensor):
+        return [parts]
+    return [leaf for part in parts for leaf in leaves(part)]
 
 
 def grouped(scene: Gaussians, group: Tensor, count: int) -> tuple[Tensor, ...]:
-    """Indices of the Gaussians of each of ``count`` groups, in Morton order; -1 is no group."""
+    """Indices of the Gaussians per group, for ``count`` groups, in Morton order; -1 means no
+    group."""
     order = morton_order(scene)
     order = order[group[order] >= 0]
     sizes = torch.bincount(group[order], minlength=count)
@@ -73,13 +71,13 @@ def grouped(scene: Gaussians, group: Tensor, count: int) -> tuple[Tensor, ...]:
 
 
 def cells(levels: Sequence[Gaussians], parents: Sequence[Tensor], most: int) -> list[Cell]:
-    """The cells of the coarsest level, with those of all finer levels below them.
+    """Cells of the coarsest level, with the cells of all finer levels below them.
 
     Args:
         levels: the finest first.
-        parents: for each level but the last, the index (M,) in the next of the parent of each
-            Gaussian; -1 for those that are left out.
-        most: Gaussians in a cell, but for children of one parent, which stay together.
+        parents: for all levels but the last, index (M,) of each Gaussian's parent in the next
+            level; -1 for dropped Gaussians.
+        most: maximum number of Gaussians in a cell; children of one parent stay together.
     """
     top = Cell(len(levels), torch.arange(len(levels[-1]), **INDICES))
     above = [top]
@@ -88,14 +86,16 @@ def cells(levels: Sequence[Gaussians], parents: Sequence[Tensor], most: int) -> 
         scene, parent = coarser[level]
         weights = torch.bincount(parent[parent >= 0], minlength=len(scene))
         number = torch.full((len(scene),), -1, **INDICES)
-        made: list[Cell] = []
+        level_cells: list[Cell] = []
         for cell in above:
             for leaf in leaves(halved(scene.means[cell.rows], weights[cell.rows], most)):
-                number[cell.rows[leaf]] = len(made)
-                made.append(Cell(level, leaf))
-                cell.children.append(made[-1])
+                number[cell.rows[leaf]] = len(level_cells)
+                level_cells.append(Cell(level, leaf))
+                cell.children.append(level_cells[-1])
         group = torch.where(parent >= 0, number[parent], -1)
-        for cell, rows in zip(made, grouped(levels[level], group, len(made)), strict=True):
+        for cell, rows in zip(
+            level_cells, grouped(levels[level], group, len(level_cells)), strict=True
+        ):
             cell.rows = rows
-        above = made
+        above = level_cells
     return top.children

@@ -1,2 +1,1 @@
-"""HTML pages in one file each, which open offline: templates, scripts, pictures and security
-policy."""
+"""Self-contained HTML pages that open offline, films, and the viewer with its web server."""

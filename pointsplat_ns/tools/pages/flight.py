@@ -1,4 +1,4 @@
-"""The data of a page that flies through scenes: views, and scenes compressed as SPZ.
+"""Data of a page to fly through scenes: views, and scenes compressed as SPZ.
 
 Lengths are in units of the content of one scene, so that precision and camera speed do not depend
 on the scene's size and position.
@@ -31,28 +31,29 @@ from pointsplat_ns.view_sampling.upright import Up, known_up
 logger = logging.getLogger("pointsplat_ns")
 
 FLIGHT_SCRIPTS = ("spz.js", "splats.js", "camera.js", "flight.js")
-"""Scripts of a flight, for :func:`~pointsplat_ns.tools.pages.html.page`; they start workers."""
+"""Scripts of a page to fly through scenes; they start workers."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlightFrame:
-    """The unit of length, the up direction and the views of a page, common to all of its scenes."""
+    """Unit of length, up direction and views of a page, shared by all of its scenes."""
 
     centre: Tensor  # [3] float64, centre of the content, scene units
     size: float  # size of the content, scene units
     up: Up
     views: Views  # in units of the content
     whole: bool
-    """Whether the first view shows all from outside: an object to circle around, not a room to look
-    around in."""
+    """Whether the first view shows the whole scene from outside: an object to circle, not a room to
+    look around in."""
 
     @staticmethod
     def of(scene: Gaussians, views: Views | None = None, up: Up | None = None) -> FlightFrame:
-        """The frame of a scene, which also suits smaller versions of it. A flight starts at the
-        known view that shows most, see
-        :func:`~pointsplat_ns.view_sampling.opening_views.opening_views`; by default up is what the
-        scene declares, that of the views, or estimated. Raises SceneError if no Gaussian can be
-        drawn, and DataError if none is visible."""
+        """The frame of a scene and of its smaller versions.
+
+        A flight starts at the known view that shows most, see
+        :func:`~pointsplat_ns.view_sampling.opening_views.opening_views`. By default, up is declared
+        by the scene, from the views, or estimated. Raises SceneError if no Gaussian can be drawn,
+        and DataError if none is visible."""
         need_usable(scene)
         known = None if views is None or len(views) == 0 else views.spread(VIEW_COUNTS.opening)
         up = known_up(up, scene)
@@ -67,30 +68,29 @@ class FlightFrame:
     def encoded(
         self, scene: Gaussians, name: str, progress: Progress = silent, level: int = 6
     ) -> bytes:
-        """A scene in units of the content, as SPZ 3; ``level`` is that of gzip. 6 takes a tenth of
-        the time of 9, for 3 % more bytes."""
+        """A scene in units of the content, as SPZ 3. ``level`` is the level of gzip; 6 takes a
+        tenth of the time of 9, for 3 % more bytes."""
         placed = in_units(scene.detach(), self.centre.to(scene.device), self.size).to(
             "cpu", torch.float32
         )
-        # Positions in SPZ have steps of 1/4096 of a unit up to 2047 units; the content's diagonal
-        # is 10.
+        # SPZ stores positions in steps of 1/4096 unit, up to 2047 units. The content's diagonal is
+        # 10 units.
         near = placed.usable() & (placed.means.abs() <= 2047.0).all(1)
         left_out = int((~near).sum())
         if left_out:
             logger.warning(
-                "%s: %d Gaussians, very far away or not finite, are not in the page", name, left_out
+                "%s: %d distant or non-finite Gaussians are left out of the page", name, left_out
             )
         return encode_spz(placed[near], progress, level=level)
 
     def packed(self, scene: Gaussians, name: str, progress: Progress = silent) -> dict[str, str]:
-        """A scene for the page: its name, its count, and its data in units of the content as base64
-        of SPZ."""
+        """A scene for the page: name, count, and SPZ data in units of the content as base64."""
         spz = base64.b64encode(self.encoded(scene, name, progress)).decode("ascii")
         return {"name": name, "amount": f"{len(scene):,} Gaussians", "spz": spz}
 
     def data(self, packed: Sequence[dict[str, str]]) -> dict[str, Any]:
-        """Data for ``flight.js``, from results of :meth:`packed` for one or two scenes; the first
-        is on the left."""
+        """Data for ``flight.js`` from results of :meth:`packed` for one or two scenes, the left one
+        first."""
         fov = 2 * torch.atan(
             0.5 * max(self.views.width, self.views.height) / self.views.Ks[:, 0, 0].abs()
         )
@@ -121,9 +121,9 @@ class FlightFrame:
 
 
 def _up_of(views: Views, estimated: Up) -> Up:
-    """The direction nearest to the mean up direction of cameras, which people hold upright: the
-    estimated one, a world axis, or the opposite of one of them. Cameras that are exactly level were
-    made for the estimated direction."""
+    """The candidate nearest to the mean up direction of cameras, which people hold upright.
+    Candidates are the estimated direction, the world axes, and their opposites. Exactly level
+    cameras are not evidence: they were sampled for the estimated direction."""
     viewmats = views.viewmats.double().cpu()
     axes = torch.cat([estimated.direction.cpu()[None], torch.eye(3, **DOUBLES)])
     axes = torch.cat([axes, -axes])

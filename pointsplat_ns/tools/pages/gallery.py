@@ -1,5 +1,7 @@
-"""Galleries of scenes before and after: a page, and one picture. A pair of pictures beside each
-result feeds both."""
+"""Draws galleries of scenes before and after: a page, and one picture.
+
+Both are made from pairs of pictures, which lie beside the results.
+"""
 
 from __future__ import annotations
 
@@ -34,15 +36,15 @@ HEIGHT = 400
 
 
 def pair_of(output: Path) -> Path:
-    """The file with the pair of pictures of a result."""
+    """File with the pair of pictures of a result."""
     return output.with_name(f"{output.name}.png")
 
 
 @torch.no_grad()
 def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Path) -> None:
-    """Draw a scene and a smaller one side by side to a PNG file, which nobody named, in the view
-    that its page opens with; ``known`` are its views, if there are any. Raises DataError if nothing
-    of the scene is visible, and SceneError if the file cannot be written."""
+    """Draw a scene before and after side by side, to an automatically named PNG file, in the first
+    view of its page. ``known`` are its views, if any. Raises DataError if nothing of the scene is
+    visible, and SceneError if the file cannot be written."""
     frame = FlightFrame.of(before, known)
     views = frame.views.resized(WIDTH)
     view = views.resized(round(max(views.width, views.height) * min(1.0, HEIGHT / views.height)))[0]
@@ -56,8 +58,8 @@ def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Pa
 
 
 def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> None:
-    """Write a page of all scenes before and after, with links to their files. Scenes that failed or
-    are not finished are listed. Raises SceneError if it cannot be written."""
+    """Write a page of all scenes before and after, with links to their files. Failed and unfinished
+    scenes are listed. Raises SceneError if the page cannot be written."""
     scenes = [_facts(result, path) for result in results]
     done = [result for result in results if result.megabytes is not None]
     sizes = [
@@ -78,13 +80,12 @@ def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> Non
 
 
 def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
-    """Write one PNG picture of all pairs that are there, with names and sizes. Raises SceneError if
-    it cannot be written."""
+    """Write one PNG file with all existing pairs of pictures, with names and sizes. Raises
+    SceneError if it cannot be written."""
     drawn = [result for result in results if _pair(result) is not None]
     columns = max(1, math.ceil(math.sqrt(len(drawn) / 3)))
-    step = max(
-        1, math.ceil(math.sqrt(len(drawn) * 2 * WIDTH * HEIGHT / 40e6))
-    )  # at most 40 million pixels
+    # At most 40 million pixels.
+    step = max(1, math.ceil(math.sqrt(len(drawn) * 2 * WIDTH * HEIGHT / 40e6)))
     height = HEIGHT // step
     width = 2 * WIDTH // step
     sheet = np.full(
@@ -92,7 +93,7 @@ def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
     )
     for index, result in enumerate(drawn):
         pair = _pair(result)
-        if pair is None:  # it has gone meanwhile
+        if pair is None:  # removed meanwhile
             continue
         before, after = _sizes(result)
         row, column = divmod(index, columns)
@@ -103,7 +104,7 @@ def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
 
 
 def _pair(result: SceneResult) -> np.ndarray | None:
-    """The pair of pictures (H, 2 W, 3) uint8 of a result; None if it is missing or damaged."""
+    """Pair of pictures (H, 2 W, 3) uint8 of a result; None if it is missing or damaged."""
     path = pair_of(Path(result.output))
     if result.megabytes is None or not is_own_file(path):
         return None
@@ -111,7 +112,7 @@ def _pair(result: SceneResult) -> np.ndarray | None:
 
 
 def _sizes(result: SceneResult) -> tuple[str, str]:
-    """Count and size before and after; a record that somebody changed may lack them."""
+    """Count and size before and after. An edited record may lack them."""
     known = (result.before, result.megabytes_before), (result.after, result.megabytes)
     before, after = (
         f"{count or 0:,} Gaussians, {bytes_text(1e6 * (size or 0.0))}" for count, size in known
@@ -120,10 +121,10 @@ def _sizes(result: SceneResult) -> tuple[str, str]:
 
 
 def _facts(result: SceneResult, path: Path) -> dict[str, Any]:
-    """What the page at a path says of a scene."""
+    """Entry of a scene in the page at ``path``."""
     finished = result.megabytes is not None
     pair = _pair(result)
-    said = str(result) if finished else result.error or "not finished"
+    text = str(result) if finished else result.error or "not finished"
     link = quote(Path(os.path.relpath(result.output, path.parent)).as_posix()) if finished else ""
     return {
         "name": result.name,
@@ -132,5 +133,5 @@ def _facts(result: SceneResult, path: Path) -> dict[str, Any]:
         "sizes": _sizes(result),
         "picture": None if pair is None else picture_uri(pair),
         "failed": bool(result.error),
-        "said": said,
+        "text": text,
     }

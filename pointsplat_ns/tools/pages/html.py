@@ -1,4 +1,4 @@
-"""HTML from the templates of this package, as one file without external resources."""
+"""Renders HTML templates of this package to one file without external resources."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    # Browsers refuse JSON with NaN or infinity.
+    # Browsers reject JSON with NaN or infinity.
     environment.policies["json.dumps_kwargs"] = {
         "allow_nan": False,
         "ensure_ascii": False,
@@ -37,15 +37,15 @@ def _environment() -> Environment:
 def page(
     template: str, scripts: Sequence[str] = (), allowed: Sequence[str] = (), **values: Any
 ) -> bytes:
-    """One HTML page, as UTF-8, with its style, scripts and data in it, from a template that extends
+    """One HTML page, UTF-8, with embedded style, scripts and data, from a template that extends
     ``base.html``.
 
-    Its content security policy allows the script and style with the page's hashes and embedded
-    pictures, and no other resource. So a text without escaping could run no code.
+    The content security policy allows embedded pictures, and only the script and style of the page,
+    by hash. Even unescaped text could not run code.
 
     Args:
         scripts: names of the scripts, in their order in the page.
-        allowed: further rules of the policy, such as ``worker-src blob:`` for workers.
+        allowed: additional rules of the policy, such as ``worker-src blob:`` for workers.
         values: variables of the template. Texts are escaped; undecodable bytes of file names become
             "?".
 
@@ -71,14 +71,14 @@ def page(
 
 
 def _source(name: str) -> str:
-    """The text of a style or script of this package."""
+    """Text of a style or script of this package."""
     environment = _environment()
     assert environment.loader is not None
     return environment.loader.get_source(environment, name)[0]
 
 
 def _unescaped(text: str) -> Markup:
-    """A style or script of this package, without escaping: browsers do not decode entities in these
+    """A style or script of this package, unescaped: browsers do not decode entities in these
     elements."""
     from markupsafe import Markup
 
@@ -87,7 +87,6 @@ def _unescaped(text: str) -> Markup:
 
 
 def _hash(text: str) -> str:
-    """The hash of an inline script or style for a content security policy."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode(
-        "ascii"
-    )
+    """Hash of an inline script or style for a content security policy."""
+    digest = hashlib.sha256(text.encode("utf-8")).digest()
+    return "sha256-" + base64.b64encode(digest).decode("ascii")

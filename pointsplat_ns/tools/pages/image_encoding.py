@@ -1,4 +1,4 @@
-"""Pictures of pages and films: as bytes, with labels, as texts, and from PNG files."""
+"""Encodes pictures of pages and films: bytes, labels, data URIs, PNG files."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def to_uint8(picture: Tensor) -> np.ndarray:
 
 
 def with_labels(pixels: np.ndarray, labels: Sequence[str]) -> np.ndarray:
-    """A picture (H, W, 3) uint8 of two halves with their labels on dark ground, at the top left and
-    the top right, shortened to a half."""
+    """A picture (H, W, 3) uint8 of two halves, with labels on a dark background at the top left and
+    top right. Long labels are shortened to fit their half."""
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
@@ -27,7 +27,7 @@ def with_labels(pixels: np.ndarray, labels: Sequence[str]) -> np.ndarray:
     size = max(round(0.03 * height), 11)  # pixels
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image, "RGBA")
-    # This font has the letters of most languages; Pillow's has Latin ones only.
+    # This font has the letters of most languages; Pillow's default has only Latin ones.
     font = ImageFont.truetype(
         str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size
     )
@@ -49,8 +49,8 @@ def with_labels(pixels: np.ndarray, labels: Sequence[str]) -> np.ndarray:
 
 
 def read_png(path: Path, width: int, height: int) -> np.ndarray | None:
-    """The pixels of a PNG file, (height, width, 3) uint8; None if it is missing, not a PNG,
-    damaged, or of another size, which is checked before the pixels are read."""
+    """Pixels of a PNG file, (height, width, 3) uint8; None if it is missing, not a PNG, damaged, or
+    of another size. The size is checked before pixels are read."""
     from PIL import Image
 
     try:
@@ -61,7 +61,7 @@ def read_png(path: Path, width: int, height: int) -> np.ndarray | None:
 
 
 def picture_uri(pixels: np.ndarray) -> str:
-    """The data URI of a picture (H, W, 3) uint8 as WebP."""
+    """Data URI of a picture (H, W, 3) uint8 as WebP."""
     from PIL import Image
 
     stream = io.BytesIO()

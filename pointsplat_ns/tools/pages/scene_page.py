@@ -1,4 +1,4 @@
-"""Writes an HTML file that flies through one scene, or two in comparison."""
+"""Writes an HTML file to fly through a scene, or to compare two."""
 
 from __future__ import annotations
 
@@ -28,25 +28,24 @@ def write_page(
     limit_mb: float = 60.0,
     progress: bool | Progress = False,
 ) -> Path:
-    """Write one HTML file that opens offline and shows a scene to fly through, or two with a wipe
-    between them.
+    """Write one HTML file to fly through a scene offline, or through two with a wipe between them.
 
-    The file needs no other file. A browser with WebGL 2 draws the scenes by the same formulas as
-    :func:`~pointsplat_ns.render`. Scenes are stored as SPZ in text, with a tenth to a quarter of
-    the bytes of a PLY; docs/formats.md gives the loss. Where two scenes make the file too large,
-    the larger one is left out, with a warning and a note in the page.
+    The file is self-contained. A browser with WebGL 2 draws scenes by the same formulas as
+    :func:`~pointsplat_ns.render`. Scenes are stored as SPZ in text, a tenth to a quarter of the
+    bytes of a PLY; docs/formats.md gives the loss. If two scenes make the file too large, the
+    larger one is left out, with a warning and a note in the page.
 
     Args:
         scenes: one scene, or two: the first is on the left of the wipe.
-        path: the file to write.
-        names: a name for each scene; by default the title, or "left" and "right".
+        path: file to write.
+        names: names of the scenes; by default the title, or "left" and "right".
         title: title of the page; by default the name of the file.
         notes: lines of text for the reader.
-        views: known views for the page's buttons; by default found from the first scene. The page
-            opens at the one that shows most, or at one that shows the whole subject. Background and
+        views: known views for the page's buttons; by default sampled for the first scene. The page
+            opens at the view that shows most, or that shows a whole object. Background and
             rasterize mode of the views apply to all scenes.
-        up: the axis that is up in the scene ("z", "-y"); by default the scene's own, that of the
-            views, or estimated.
+        up: up axis of the scene ("z", "-y"); by default declared by the scene, from the views, or
+            estimated.
         limit_mb: maximum size of the file, in units of 10^6 bytes.
         progress: True shows a bar; a function is called with the name of the task and its share
             done.
@@ -55,8 +54,8 @@ def write_page(
         ``path``.
 
     Raises:
-        PointSplatError: if there are no scenes or more than two, names do not fit, or one scene
-            alone is too large.
+        PointSplatError: if there are no scenes or more than two, the number of names differs, or
+            one scene alone is too large.
         SceneError: if no Gaussian of a scene can be drawn, or the file cannot be written.
         DataError: if no Gaussian of the first scene is visible.
 

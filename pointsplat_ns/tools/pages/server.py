@@ -1,8 +1,8 @@
-"""The web server of the viewer: fixed routes, for pages that it served itself.
+"""The web server of the viewer, with fixed routes for its own pages.
 
-Nothing of a request is a path. Pages of other sites, and names that resolve to this machine, are
-refused. Connections are bounded in number and in time, so that clients who are slow, or many, do
-not keep others away.
+No part of a request becomes a path. Requests from pages of other sites, and to foreign names that
+resolve to this machine, are refused. Connections are limited in number and time, so that slow or
+numerous clients do not block others.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds of connections."""
+    """Limits of connections."""
 
     connections: int = 64
-    """Largest number that is open. A browser has up to 6 to a page."""
+    """Maximum number of open connections. A browser opens up to 6 per page."""
     of_one_address: int = 32
-    """Largest number that is open to one address, so that others have some."""
+    """Maximum number of open connections per address, so that some remain for others."""
     head_seconds: float = 5.0
-    """Time for the first lines of a request, s."""
+    """Time limit for the head of a request, s."""
     idle_seconds: float = 30.0
-    """Time without a byte of a body or an answer, s."""
+    """Time limit without a byte of a body or an answer, s."""
     bytes_a_second: float = 50_000.0
-    """Least rate of bodies and answers, after ``idle_seconds``."""
+    """Minimum rate of bodies and answers, after ``idle_seconds``."""
 
 
 LIMITS = Limits()
@@ -51,7 +51,7 @@ class _Connection:
     address: str
     begun: float
     deadline: float | None
-    """When it is cut; None while its answer is made."""
+    """Time at which it is cut; None while its answer is computed."""
     in_head: bool = True
 
 
@@ -59,9 +59,9 @@ class _Connection:
 class Request:
     """A request to a route."""
 
-    options: Mapping[str, str]  # what follows "?" in its address
+    options: Mapping[str, str]  # query of the address
     length: int  # of its body, bytes
-    body: Body  # reads are empty if the client sends less than it said
+    body: Body  # reads are empty if the client sends less than declared
 
 
 class Body(Protocol):
@@ -74,7 +74,7 @@ class Body(Protocol):
 
 @dataclass(frozen=True)
 class Answer:
-    """What a route answers."""
+    """The answer of a route."""
 
     body: bytes = b""
     kind: str = "text/plain; charset=utf-8"
@@ -87,13 +87,13 @@ class Route:
     """A path of the server."""
 
     answer: Callable[[Request], Answer]
-    largest: int = 0  # body, bytes; 0 for requests without one, which get pages
+    largest: int = 0  # maximum body of a POST, bytes; 0 for GET
 
 
 class Server(ThreadingHTTPServer):
-    """Answers requests to routes, on threads of its own, until it is closed. ``port`` is the first
-    to try; 0 takes any free port. Raises PointSplatError if no port is free, or the host is not an
-    address of this machine."""
+    """Answers requests to routes, on its own threads, until it is closed. ``port`` is the first
+    port to try; 0 takes any free port. Raises PointSplatError if no port is free, or the host is
+    not an address of this machine."""
 
     daemon_threads = True
     block_on_close = False
@@ -132,27 +132,27 @@ class Server(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, name="serving", daemon=True).start()
 
     def server_bind(self) -> None:
-        """Bind without a look-up of the machine's name, which may take seconds."""
+        """Bind without looking up the machine's name, which may take seconds."""
         TCPServer.server_bind(self)
         self.server_name = str(self.server_address[0])
         self.server_port = int(self.server_address[1])
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection. If there are too many, the one that has taken longest for its head
-        gives way; if none is in its head, the new one is closed."""
+        """Serve a connection. If there are too many, the oldest connection without a complete head
+        is cut. If there is none, the new connection is closed."""
         address = str(client_address[0])
         now = time.monotonic()
         with self._lock:
             every = list(self._open.items())
-            of_address = [each for each in every if each[1].address == address]
+            of_address = [entry for entry in every if entry[1].address == address]
             rivals = []
             if len(of_address) >= self.limits.of_one_address:
                 rivals = of_address
             elif len(every) >= self.limits.connections:
                 rivals = every
-            waiting = [each for each in rivals if each[1].in_head]
+            waiting = [entry for entry in rivals if entry[1].in_head]
             if waiting:
-                self._cut(min(waiting, key=lambda each: each[1].begun)[0])
+                self._cut(min(waiting, key=lambda entry: entry[1].begun)[0])
             refused = bool(rivals) and not waiting
             if not refused:
                 self._open[request] = _Connection(address, now, now + self.limits.head_seconds)
@@ -168,7 +168,7 @@ class Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def service_actions(self) -> None:
-        """Cut connections whose time is over; called twice a second."""
+        """Cut connections past their time limit; called twice per second."""
         now = time.monotonic()
         with self._lock:
             for request, connection in list(self._open.items()):
@@ -176,14 +176,14 @@ class Server(ThreadingHTTPServer):
                     self._cut(request)
 
     def _cut(self, request: Any) -> None:
-        """End a connection: what its thread waits for fails, and it closes it."""
+        """End a connection: its thread gets an error and closes it."""
         self._open.pop(request, None)
-        with suppress(OSError):  # the client has gone
+        with suppress(OSError):  # the client has disconnected
             request.shutdown(socket.SHUT_RDWR)
 
     def expect(self, request: Any, size: int | None) -> None:
-        """Give a connection, whose head is complete, the time for ``size`` bytes; any time while an
-        answer is made, if None."""
+        """Set the time limit of a connection with a complete head, for ``size`` bytes; None sets no
+        limit, while an answer is computed."""
         limits = self.limits
         seconds = 0 if size is None else limits.idle_seconds + size / limits.bytes_a_second
         with self._lock:
@@ -193,14 +193,14 @@ class Server(ThreadingHTTPServer):
                 connection.deadline = None if size is None else time.monotonic() + seconds
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing of a client that has gone."""
+        """Ignore errors of a disconnected client."""
 
 
 def refusal(
     method: str, headers: Mapping[str, str], hosts: tuple[str, ...] | None
 ) -> http.HTTPStatus | None:
-    """The status of a request that is refused for its sender; None if it is served. Browsers name
-    the origin of each POST. ``hosts`` are accepted names of the server; None for any."""
+    """The status of a request refused for its origin; None if it is served. Browsers send the
+    origin of every POST. ``hosts`` are the accepted names of the server; None for any."""
     asked = headers.get("Host", "")
     origin = headers.get("Origin")
     name = asked[1 : asked.find("]")] if asked.startswith("[") else asked.partition(":")[0]
@@ -212,7 +212,7 @@ def refusal(
 
 
 class _Body:
-    """The body of a request, which has its time until it is complete."""
+    """The body of a request, with a time limit until it is complete."""
 
     def __init__(self, handler: _Handler, length: int):
         self._handler = handler
@@ -261,7 +261,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.expect(len(answer.body))
         self.end_headers()
-        for start in range(0, len(answer.body), 1 << 20):  # the time limit holds for each piece
+        for start in range(0, len(answer.body), 1 << 20):  # the time limit applies to each piece
             self.wfile.write(answer.body[start : start + (1 << 20)])
 
     do_POST = do_GET
@@ -294,5 +294,5 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             return route.answer(Request(options, int(length), _Body(self, int(length))))
         except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-            # A body that no page of this server sends.
+            # No page of this server sends such a body.
             return Answer(status=http.HTTPStatus.BAD_REQUEST)

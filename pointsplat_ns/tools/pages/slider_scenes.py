@@ -1,4 +1,4 @@
-"""A scene at the shares of a slider: chosen by a score at once, then merged."""
+"""Scenes at the shares of a slider: first selected by a score, then merged."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from pointsplat_ns.system.files import one_line
 
 @dataclass(eq=False)
 class Level:
-    """A scene at a share of its Gaussians."""
+    """A scene with a share of its Gaussians."""
 
     scene: Gaussians
-    how: str  # text on the way it was made, which follows the count
-    spz: bytes = b""  # the scene for pages, once one has asked for it
+    how: str  # text on its method, which follows the count
+    spz: bytes = b""  # the encoded scene, after the first request
 
 
 class MergingStopped(Exception):
-    """Raised in merging once a page has chosen another share."""
+    """Raised while merging when a page has chosen another share."""
 
 
 class ViewedScene:
-    """A scene for the viewer, at any share of its Gaussians, for several pages, whose requests have
-    threads of their own. Merging is to the count of ``pointsplat prune``, which gives its scene.
+    """A scene for the viewer, with any share of its Gaussians. Several pages may use it, from
+    threads of their own. Merged scenes equal the results of ``pointsplat prune``.
 
-    Undrawable Gaussians are left out; raises SceneError if nothing is left.
+    Undrawable Gaussians are dropped. Raises SceneError if none remains.
 
     Args:
-        name: for people.
-        path: of the scene; None if it has none.
+        name: name to show.
+        path: path of the scene; None if it has none.
         scene: N Gaussians.
-        source: source of views; merging uses those of its dataset.
-        there: smaller scenes that exist already, such as levels of a stream; each stands for shares
-            near its count.
+        source: source of views for merging.
+        there: existing smaller scenes, such as levels of a stream; each serves shares near its
+            count.
     """
 
     def __init__(
@@ -68,26 +68,25 @@ class ViewedScene:
             Level(level, f"level {n} of the stream") for n, level in enumerate(there, start=1)
         ]
         self._chosen: tuple[int, Level] = (100, self.whole)
-        """The newest share that was chosen by coverage."""
+        """The latest share selected by coverage, with its level."""
         self._merged: dict[int, Level] = {}
         self._choices = 0
-        """Number of choices of a share so far; each stops the merging to an older one."""
+        """Number of choices of a share so far. A new choice stops merging for older ones."""
         self._merging = threading.Lock()
 
     def at(self, percent: int) -> Level:
-        """The best level of 1 to 100 percent of the Gaussians without more merging."""
+        """The best available level of 1 to 100 percent of the Gaussians, without merging."""
         found = self.ready(percent)
         if found is None and self._chosen[0] != percent:
             self._chosen = (percent, Level(self._by_coverage(percent), "chosen by coverage"))
         return found or self._chosen[1]
 
     def stop(self) -> None:
-        """Stop merging: a page has chosen another share, or has gone."""
+        """Stop merging: a page has chosen another share, or was closed."""
         self._choices += 1
 
     def merged(self, percent: int) -> Level | None:
-        """The level of a share that needs no more merging, after merging if there is none; None if
-        that was stopped."""
+        """The final level of a share, merged if necessary; None if merging was stopped."""
         with self._merging:
             if (found := self.ready(percent)) is not None:
                 return found
@@ -105,17 +104,17 @@ class ViewedScene:
             except (PointSplatError, MemoryError, RuntimeError) as error:
                 how = f"chosen by coverage, because merging failed: {one_line(error)}"
                 level = Level(self._by_coverage(percent), how)
-            # Older ones are kept as long as all together have no more Gaussians than the scene
-            # itself.
-            kept = sum(len(older.scene) for older in self._merged.values())
-            while self._merged and kept + len(level.scene) > len(self.scene):
-                kept -= len(self._merged.pop(next(iter(self._merged))).scene)
+            # Older levels stay in memory while all together have at most as many Gaussians as the
+            # scene.
+            cached = sum(len(older.scene) for older in self._merged.values())
+            while self._merged and cached + len(level.scene) > len(self.scene):
+                cached -= len(self._merged.pop(next(iter(self._merged))).scene)
             self._merged[percent] = level
             return level
 
     def ready(self, percent: int) -> Level | None:
-        """The level of a share that needs no merging any more: of a stream, merged, or all; None if
-        there is none."""
+        """The final level of a share, if it is available: a level of a stream, merged, or all
+        Gaussians."""
         if percent == 100:
             return self.whole
         count = len(self.scene) * percent / 100
@@ -125,8 +124,7 @@ class ViewedScene:
         )
 
     def close(self, timeout: float) -> None:
-        """Stop merging, and wait for it at most ``timeout`` seconds; nothing is merged
-        afterwards."""
+        """Stop merging, wait for at most ``timeout`` seconds, and prevent further merging."""
         self.stop()
         self._merging.acquire(timeout=timeout)
 

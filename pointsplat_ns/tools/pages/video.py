@@ -1,4 +1,4 @@
-"""Writes frames to an MP4 video, a folder of PNG files, or one PNG, completely or not at all."""
+"""Writes frames to an MP4 video, a folder of PNG files, or one PNG file: all or nothing."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from pointsplat_ns.system.outputs import claim
 Kind = Literal["video", "frames", "picture"]
 
 ENCODER = "libx264"
-"""ffmpeg's encoder of H.264. PyAV's wheels have it; other builds may lack it."""
+"""H.264 encoder of ffmpeg. PyAV's wheels include it; other builds may not."""
 
 _FRAME = re.compile(r"frame_\d{5,}\.png")
 
 
 def check_output(output: Path | str, force: bool) -> Kind:
-    """The kind of an output, checked before the long work: a video (.mp4), one picture (.png), or a
+    """The kind of an output, checked before long work: a video (.mp4), one picture (.png), or a
     folder of frames (no suffix). Raises SceneError if the path has another suffix, cannot be
     written, or must not be overwritten."""
     path = Path(output)
@@ -40,10 +40,12 @@ def check_output(output: Path | str, force: bool) -> Kind:
             claim(path)
         found = sorted(item.name for item in path.iterdir()) if path.exists() else []
         if others := [name for name in found if not _FRAME.fullmatch(name)]:
-            raise SceneError(f"{path}: holds {others[0]}; expected a new folder, or one of frames")
+            raise SceneError(
+                f"{path}: contains {others[0]}; expected a new folder, or a folder of frames"
+            )
         if found and not force:
             raise SceneError(
-                f"{path}: holds frames already; name another folder, or overwrite them with --force"
+                f"{path}: contains frames; name another folder, or overwrite them with --force"
             )
         return "frames"
     kinds: dict[str, Kind] = {".mp4": "video", ".png": "picture"}
@@ -51,7 +53,7 @@ def check_output(output: Path | str, force: bool) -> Kind:
     if kind is None:
         raise SceneError(
             f"{path}: cannot write a {path.suffix} file; expected a video (.mp4), a picture (.png) "
-            "or a folder, whose name has no dot"
+            "or a folder (a name without a dot)"
         )
     need_writable(path, force)
     return kind
@@ -60,9 +62,11 @@ def check_output(output: Path | str, force: bool) -> Kind:
 def write_frames(
     frames: Iterable[np.ndarray], path: Path, kind: Kind, fps: float, force: bool = True
 ) -> int:
-    """Write all frames, (H, W, 3) uint8 each, or none; returns their number. Those of a video have
-    one size, of even width and height; a picture is one frame. What is there is replaced; a folder
-    with frames only if ``force`` is true. Raises SceneError if it cannot be written."""
+    """Write all frames, (H, W, 3) uint8 each, or nothing, and return their number.
+
+    Frames of a video have the same even width and height; a picture is one frame. Existing files
+    are replaced, a folder with frames only if ``force``. Raises SceneError if the output cannot be
+    written."""
     if kind == "video":
         return _write_video(frames, path, fps)
     if kind == "frames":
@@ -74,7 +78,7 @@ def write_frames(
 
 
 def _write_folder(frames: Iterable[np.ndarray], folder: Path, force: bool) -> int:
-    """Write frames to a new folder, which then replaces ``folder`` and its frames."""
+    """Write frames to a new folder, which then replaces ``folder``."""
     count = 0
     with replacing_folder(folder, "frame_00000.png", _FRAME.pattern, force) as part:
         for pixels in frames:

@@ -1,5 +1,4 @@
-"""The viewer: a page that draws a scene in the browser, and asks this server for it at other shares
-of its Gaussians."""
+"""The viewer: a page that draws a scene in the browser, and a server for other shares of it."""
 
 from __future__ import annotations
 
@@ -31,14 +30,14 @@ READABLE_NAMES = (
     *(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")),
     ".pt",
 )
-"""Ends of the names of files that may be dropped."""
+"""Suffixes of files that may be dropped."""
 
 LARGEST_FILE = 4_000_000_000
-"""Largest file that may be dropped, bytes."""
+"""Maximum size of a dropped file, bytes."""
 
 
 class _Stage:
-    """The scenes that are shown, from where, and at which shares."""
+    """The shown scenes and their common views."""
 
     def __init__(self, scenes: Sequence[ViewedScene], up: Up | None, number: int, drops: bool):
         self.scenes = scenes
@@ -59,8 +58,8 @@ class _Stage:
         self.html = _live_page(" and ".join(viewed.name for viewed in scenes), data, drops)
 
     def state(self, index: int, percent: int, level: Level, whole: bool) -> dict[str, Any]:
-        """What a page says of a level, with the command that makes it; ``whole`` if no better one
-        comes."""
+        """Text of the page on a level, with the command that makes it; ``whole`` if the level is
+        final."""
         viewed = self.scenes[index]
         command = ""
         amount = f"{len(viewed.scene):,} Gaussians"
@@ -75,19 +74,19 @@ class _Stage:
         return {"amount": amount, "command": command, "how": level.how, "whole": whole}
 
     def close(self, timeout: float) -> None:
-        """Stop merging, and wait for it at most ``timeout`` seconds."""
+        """Stop merging, and wait for at most ``timeout`` seconds."""
         for viewed in self.scenes:
             viewed.close(timeout)
 
 
 class Viewer(AbstractContextManager["Viewer"]):
-    """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the
-    context of a ``with`` block.
+    """Shows one or two scenes of the same frame in the browser, until it is closed; usable in a
+    ``with`` block.
 
-    Without scenes, a page takes a dropped file, which ``read`` reads with its name. ``port`` is the
-    first to try; 0 takes any free port. By default up is that of the first scene's known views, or
-    estimated. Raises SceneError if no Gaussian of a scene can be drawn, DataError if none of the
-    first scene is visible, and PointSplatError if no port is free.
+    Without scenes, the page opens a dropped file with ``read``, from its path and name. ``port`` is
+    the first port to try; 0 takes any free port. By default, up comes from the first scene's known
+    views, or is estimated. Raises SceneError if no Gaussian of a scene can be drawn, DataError if
+    none of the first scene is visible, and PointSplatError if no port is free.
     """
 
     def __init__(
@@ -98,7 +97,7 @@ class Viewer(AbstractContextManager["Viewer"]):
         up: Up | None = None,
         read: Callable[[Path, str], ViewedScene] | None = None,
     ):
-        share_freed_memory()  # each request has a thread
+        share_freed_memory()  # every request has its own thread
         self._up = up
         self._read = read
         self._working = threading.Lock()
@@ -115,25 +114,25 @@ class Viewer(AbstractContextManager["Viewer"]):
 
     @property
     def origin(self) -> str:
-        """Text on the origin of the first view; empty without a scene."""
+        """Text on the origin of the first view; empty without scenes."""
         return "" if self._stage is None else self._stage.origin
 
     def wait(self) -> None:
         """Wait until Ctrl-C."""
-        while True:  # a signal that another thread got is seen when this one wakes
+        while True:  # this thread handles signals of other threads when it wakes
             time.sleep(0.5)
 
     def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """End the server and all drawing. A second call does nothing."""
+        """Stop the server and all work. A second call does nothing."""
         if self._server.fileno() < 0:
             return
         self._server.shutdown()
         self._server.server_close()
-        # Threads that are in torch when the program ends abort it: they are waited for, and these
-        # locks are kept.
+        # A thread inside torch at exit would abort the program. So wait for it, and never release
+        # these locks.
         for lock in (self._working, self._dropping):
             lock.acquire(timeout=5.0)  # s
         if self._stage is not None:
@@ -151,8 +150,8 @@ class Viewer(AbstractContextManager["Viewer"]):
         return Answer(html, "text/html; charset=utf-8")
 
     def _scene(self, request: Request) -> Answer:
-        """A scene at a share, as SPZ unless the page has it. A page that has one waits for a better
-        one; a page of other scenes than those that are shown gets an answer to load again."""
+        """A scene at a share, as SPZ unless the page has it already. A page with a preliminary
+        level waits for the final one. A page of earlier scenes is told to reload."""
         wanted = json.loads(request.body.read(request.length))
         stage = self._stage
         if stage is None or wanted["stage"] != stage.number:
@@ -170,13 +169,14 @@ class Viewer(AbstractContextManager["Viewer"]):
         if level.how == have or not wanted["spz"]:
             return Answer(status=HTTPStatus.NO_CONTENT, headers=headers)
         with self._working:
-            # gzip's level 1 takes half of the time of 6, for 5 % more bytes, which go nowhere far.
+            # Level 1 of gzip takes half the time of 6, for 5 % more bytes, mostly on the same
+            # machine.
             level.spz = level.spz or stage.frame.encoded(level.scene, viewed.name, level=1)
         return Answer(level.spz, "application/octet-stream", headers=headers)
 
     def _drop(self, request: Request) -> Answer:
-        """Take a dropped file, and show its scene. The client's name for it is shown to people. It
-        is no path: only its end is used, if it is one of :data:`READABLE_NAMES`."""
+        """Show the scene of a dropped file. The client's file name is only displayed, never used as
+        a path; only its suffix counts, if it is one of :data:`READABLE_NAMES`."""
         assert self._read is not None
         given = request.options["name"]
         name = "".join(
@@ -198,7 +198,7 @@ class Viewer(AbstractContextManager["Viewer"]):
 
 
 def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
-    """The page, with scenes that it asks this server for; without a flight it only takes a file."""
+    """The page, which loads scenes from this server; without a flight it only accepts a file."""
     scripts = (
         *((*FLIGHT_SCRIPTS, "live.js", "scene.js") if flight else ()),
         *(("drop.js",) if drops else ()),
@@ -217,9 +217,9 @@ def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
 
 
 def _receive(request: Request, path: Path, suffix: str) -> None:
-    """Write the body of a request to a file. Raises SceneError if no scene has such a name, the
-    file is empty, or there is no room for it, and ValueError if the client sends less than it
-    said."""
+    """Write the body of a request to a file. Raises SceneError if the suffix is not of a scene, the
+    file is empty, or there is no room for it, and ValueError if the client sends less than
+    declared."""
     if not suffix:
         raise SceneError(f"{path}: not a scene; expected a file of {', '.join(READABLE_NAMES)}")
     if request.length == 0:

@@ -1,1 +1,1 @@
-"""Measures the tradeoff of a scene: quality against frame time, number of Gaussians and bytes."""
+"""Measures the tradeoff of a scene: quality against frame time, count and size."""

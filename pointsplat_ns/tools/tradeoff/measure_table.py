@@ -1,4 +1,4 @@
-"""Measures a table of budgets by methods and repairs, and writes it as JSON and as a page."""
+"""Measures a table of budgets, methods and repairs, and writes it as JSON and as a page."""
 
 from __future__ import annotations
 
@@ -59,40 +59,40 @@ def measure_tradeoff(
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Tradeoff:
-    """Measure how a scene trades quality for frame time, size and count, on this machine: each
-    method and repair at each budget.
+    """Measure how a scene trades quality for frame time, size and count on this machine, for all
+    combinations of budgets, methods and repairs.
 
     Args:
-        scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are then used where
-            they are found.
-        folder: where the figures (JSON) and the page go.
-        keep: budgets, as for :func:`pointsplat_ns.prune`, but for a PSNR.
-        within: the recommended point is the fastest that loses at most so much, dB: against photos,
-            or as much as is expected of its renders
-            (:mod:`~pointsplat_ns.tools.tradeoff.recommend`).
+        scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are used if
+            available.
+        folder: output folder for the figures (JSON) and the page.
+        keep: budgets, as for :func:`pointsplat_ns.prune` except a PSNR.
+        within: maximum loss of the recommended point against photos, dB. Without photos, the loss
+            is estimated from renders (:mod:`~pointsplat_ns.tools.tradeoff.recommend`). The fastest
+            such point is recommended.
         by: methods, as for :func:`pointsplat_ns.prune`.
         repairs: some of "none", "quick" and "thorough", the efforts of
             :func:`pointsplat_ns.compact`, and "photos", its training on the photos.
-        views: largest number of views that are timed, and of photos; without photos at most 12.
-        poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no
-            photos are used then, unless they are named.
-        resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged in pictures of this size,
-            as by every command. Frames are timed, and pictures drawn, at a middle size, of 784 x
-            441 pixels for 1920 x 1080; photos are reduced to it.
+        views: maximum number of timed views and of photos; without photos at most 12.
+        poses: camera file, as ``views`` of :func:`pointsplat_ns.prune`. The photos of a run are
+            then not used, unless ``photos`` is given.
+        resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged at this size, as by every
+            command. Frames are timed and drawn at a middle size, 784 x 441 pixels for 1920 x 1080;
+            photos are reduced to it.
         up: as for :func:`pointsplat_ns.prune`.
-        data, photos: as for :func:`pointsplat_ns.prune`; the photos of a run are used anyway.
+        data, photos: as for :func:`pointsplat_ns.prune`; photos of a run are used by default.
         force: overwrite results in the folder.
         progress: True shows a bar; a function is called with the task and its share done.
 
     Returns:
-        Every point, and the recommended one: see :class:`Tradeoff`.
+        All points, and the recommended one: see :class:`Tradeoff`.
 
     Raises:
-        BudgetError: if a budget means nothing, or does not fit the scene.
+        BudgetError: if a budget is invalid, or does not fit the scene.
         SceneError: if the scene or the folder is not usable.
-        DataError: if there is no view, or most of those of ``poses`` see nothing of the scene.
-        PointSplatError: if there is no such method or repair, or a number means nothing.
-        KeyboardInterrupt: after the results of an interrupted measurement were written.
+        DataError: if there is no view, or most views of ``poses`` see nothing of the scene.
+        PointSplatError: if a method or repair is unknown, or a number is invalid.
+        KeyboardInterrupt: on Ctrl-C, after the results so far are written.
 
     Example:
         >>> import tempfile
@@ -121,9 +121,9 @@ def measure_tradeoff(
             for number, setting in enumerate(table, start=1):
 
                 def show(
-                    what: str, share: float, name: str = f"point {number} of {len(table)}"
+                    task: str, share: float, name: str = f"point {number} of {len(table)}"
                 ) -> None:
-                    report(f"{name}: {what}", share)
+                    report(f"{name}: {task}", share)
 
                 made = (subject.dense, 0.0) if setting.by == DENSE else make(subject, setting, show)
                 measuring.add(setting, *made, show)
@@ -137,14 +137,14 @@ def measure_tradeoff(
 def check_options(
     keep: Sequence[Keep | str], by: Sequence[str], repairs: Sequence[str], within: float, views: int
 ) -> None:
-    """Raise a PointSplatError if an option means nothing."""
+    """Raise a PointSplatError if an option is invalid."""
     if not 0 < within < math.inf:
         raise PointSplatError(f"a loss of {within:g} dB; expected a positive number, such as 0.5")
     if views < 1:
         raise PointSplatError(f"{views} views; expected at least one")
     if not keep or not by:
         raise PointSplatError(
-            "no budget or no method is named; expected at least one of each, such as 10%, merge"
+            "no budget or no method; expected at least one of each, such as 10% and merge"
         )
     for budget in keep:
         if isinstance(budget, str):
@@ -160,11 +160,11 @@ def check_options(
 def settings_of(
     dense: Gaussians, keep: Sequence[Keep | str], by: Sequence[str], repairs: Sequence[str]
 ) -> list[Setting]:
-    """The dense scene, and all combinations of options, each once, the largest first."""
+    """The dense scene, then all distinct combinations of options, the largest first."""
     counts = {resolve_keep(len(dense), budget, dense.sh_degree, dense.traits) for budget in keep}
     ordered = [repair for repair in REPAIRS if repair in repairs]
-    ways = itertools.product(sorted(counts, reverse=True), ordered, dict.fromkeys(by))
-    return [Setting(len(dense), by=DENSE), *(Setting(*way) for way in ways)]
+    combinations = itertools.product(sorted(counts, reverse=True), ordered, dict.fromkeys(by))
+    return [Setting(len(dense), by=DENSE), *(Setting(*options) for options in combinations)]
 
 
 class _Measuring:
@@ -181,7 +181,7 @@ class _Measuring:
             {} if photos is None else {"photo": picture_uri(to_uint8(photos[index].target))}
             for index in self.shown
         ]
-        """For each view, pictures for the page: the photo, and that of each point by its key."""
+        """Pictures for the page by view: the photo, and the render of each point by key."""
 
     @torch.no_grad()
     def add(self, setting: Setting, scene: Gaussians, seconds: float, show: Progress) -> None:
@@ -197,7 +197,7 @@ class _Measuring:
         """Write and return the results so far."""
         measurer = self.measurer
         busy = busy_note([point.others_cores for point in self.points])
-        best, why = recommend(self.points, self.within, trusted=not busy)
+        best, reason = recommend(self.points, self.within, trusted=not busy)
         found = Tradeoff(
             scene=name_of(measurer.subject.path),
             machine=machine_text(measurer.dense.device),
@@ -208,7 +208,7 @@ class _Measuring:
             points=tuple(self.points),
             notes=tuple(filter(None, (busy, measurer.note, note))),
             recommended=best.key,
-            why=why,
+            why=reason,
         )
         write_points(found, self.folder)
         write_page(found, self.pictures, self.folder / RESULTS["page"])
@@ -216,9 +216,8 @@ class _Measuring:
 
 
 def write_page(found: Tradeoff, pictures: Sequence[dict[str, str]], output: Path) -> None:
-    """Write one HTML file with the points of a scene, which needs no other file. ``pictures`` are,
-    for each view, data URIs of the picture of each point by its key, and of the photo as
-    ``photo``."""
+    """Write a self-contained HTML file with the points of a scene. ``pictures`` has, per view, data
+    URIs of the render of each point by key, and of the photo as ``photo``."""
     dense = found.points[0]
     best = found.point(found.recommended)
     shown = next_best(found.points) or best if best is dense else best
@@ -243,22 +242,17 @@ def write_page(found: Tradeoff, pictures: Sequence[dict[str, str]], output: Path
 
 
 def _data(point: Point) -> dict[str, Any]:
-    """Data of a point for the scripts; None for what was not measured, or differs in nothing."""
+    """Data of a point for scripts; None for figures that were not measured or are infinite."""
 
     def finite(quality: ImageMetrics | None) -> dict[str, float | None]:
         psnr = None if quality is None or quality.psnr == math.inf else quality.psnr
         return {"psnr": psnr, "ssim": None if psnr is None or quality is None else quality.ssim}
 
-    figures = (
-        []
-        if point.against_photos is None
-        else [f"{point.against_photos.psnr:.1f} dB against photos"]
-    )
-    figures += (
-        []
-        if point.by == "dense"
-        else [f"{decibels(point.against_dense.psnr)} against the dense scene"]
-    )
+    figures = []
+    if point.against_photos is not None:
+        figures.append(f"{point.against_photos.psnr:.1f} dB against photos")
+    if point.by != DENSE:
+        figures.append(f"{decibels(point.against_dense.psnr)} against the dense scene")
     figures += [
         f"{point.speed.median:.2g} times as fast",
         f"{point.gaussians:,} Gaussians",

@@ -1,4 +1,4 @@
-"""A scene to be measured, and how the scene of a setting is made: like its command."""
+"""A scene to measure, and the smaller scenes of its settings, made as by their commands."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ class Subject:
     dense: Gaussians
     path: Path
     new_views: Callable[[], ViewProvider]
-    """Makes a new source of its views, the same as for its commands."""
+    """Makes a new source of views, as its commands do."""
     held_out: Callable[[], Photos] | None = None
-    """Reads its held-out photos; None if it cannot have any."""
+    """Reads the held-out photos; None if there cannot be any."""
     training: Photos | None = None
-    """Its training photos, for the repair ``photos``."""
+    """Training photos, for the repair ``photos``."""
     words: tuple[str, ...] = ()
-    """Options of its commands on views, such as ``--poses FILE``."""
+    """Options on views for its commands, such as ``--poses FILE``."""
     resolution: tuple[int, int] | None = None
-    """Width and height of pictures in pixels, if given; ``new_views`` has them too."""
+    """Width and height of pictures, pixels, if given; also those of ``new_views``."""
     photos: Path | None = None
-    """Folder of its photos, if they are not those of its run."""
+    """Folder of photos, unless they belong to the run."""
 
     def names(self, setting: Setting) -> dict[str, Any]:
-        """The key, the label and the command of a setting's point. The command has the count,
-        because percentages are rounded."""
+        """Key, label and command of a setting's point. The command has the count, because
+        percentages are rounded."""
         if setting.by == DENSE:
             return {"key": DENSE, "label": DENSE, "command": ""}
         percent = 100 * setting.count / len(self.dense)
@@ -58,25 +58,16 @@ class Subject:
             label = f"{label} by {setting.by}"
             options += ["--by", setting.by]
         if setting.repair != "none":
-            trained = (
-                "trained on photos"
-                if setting.repair == "photos"
-                else f"repaired ({setting.repair})"
-            )
+            on_photos = setting.repair == "photos"
+            repaired = "trained on photos" if on_photos else f"repaired ({setting.repair})"
             key = f"{key}_{setting.repair}"
-            label = f"{label}, {trained}"
+            label = f"{label}, {repaired}"
             command = "compact"
             options += ["--effort", EFFORTS[setting.repair]]
         if setting.repair == "photos":
             options += ["--photos", *([] if self.photos is None else [str(self.photos)])]
-        words = [
-            "pointsplat",
-            command,
-            str(self.path),
-            *options,
-            "-o",
-            f"{name_of(self.path)}_{key}.ply",
-        ]
+        output = f"{name_of(self.path)}_{key}.ply"
+        words = ["pointsplat", command, str(self.path), *options, "-o", output]
         return {"key": key, "label": label, "command": shlex.join(words)}
 
 
@@ -87,12 +78,12 @@ def subject_at(
     progress: Progress,
     training: bool,
 ) -> Subject:
-    """The scene at a path, with the options on views that its commands repeat; ``photos`` is a
-    folder of photos. With ``training``, photos are also trained on. Raises a PointSplatError if
+    """Read the scene at a path, with the options on views that its commands repeat. ``photos`` is a
+    folder of photos. With ``training``, training photos are read too. Raises a PointSplatError if
     there are none."""
     options.check()
-    asked: Path | bool = training if photos is None else photos
-    read = read_subject(path, options, photos=asked, training=training, progress=progress)
+    folder_or_run: Path | bool = training if photos is None else photos
+    read = read_subject(path, options, photos=folder_or_run, training=training, progress=progress)
     held_out: Callable[[], Photos] | None = None
     if photos is not None:
         held_out = lambda: read.held_out  # noqa: E731
@@ -123,8 +114,8 @@ def subject_at(
 
 
 def make(subject: Subject, setting: Setting, progress: Progress) -> tuple[Gaussians, float]:
-    """The scene of a setting, and the seconds that it took: from a new source of views, so that
-    time and result equal the command's. Raises KeyboardInterrupt on Ctrl-C, also during a
+    """Make the scene of a setting, and measure the duration in seconds. A new source of views makes
+    time and result equal to the command's. Raises KeyboardInterrupt on Ctrl-C, also during a
     repair."""
     dense = subject.dense
     views = subject.new_views()
@@ -133,13 +124,13 @@ def make(subject: Subject, setting: Setting, progress: Progress) -> tuple[Gaussi
         options = PruneOptions(keep=setting.count, by=setting.by)
         scene = prune_scene(dense, options, views, progress).scene
     else:
-        asked = CompactOptions(
+        compact_options = CompactOptions(
             keep=setting.count,
             by=setting.by,
             effort=EFFORTS[setting.repair],
             photos=setting.repair == "photos",
         ).completed()
-        compacted = compact_scene(dense, asked, views, progress, subject.training)
+        compacted = compact_scene(dense, compact_options, views, progress, subject.training)
         if compacted.interrupted:
             raise KeyboardInterrupt
         scene = compacted.scene

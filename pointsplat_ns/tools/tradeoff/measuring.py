@@ -1,8 +1,7 @@
-"""Measures one point: compares a smaller scene with the dense scene and with photos, and times its
-frames.
+"""Measures a point: compares a smaller scene with the dense scene and photos, and times its frames.
 
-On a shared machine the time of a frame may double within a minute. So each frame is timed beside a
-frame of the dense scene in the same view: both slow down alike, and the ratio of their times stays.
+On a shared machine, frame times may double within a minute. So every frame is timed next to a frame
+of the dense scene in the same view: both slow down alike, and the ratio of their times stays.
 """
 
 from __future__ import annotations
@@ -37,13 +36,12 @@ from pointsplat_ns.tools.tradeoff.points import DENSE, ImageMetrics, Point, Sett
 from pointsplat_ns.tools.wording import origin_text
 
 ROUNDS = 3
-"""Number of timed frames of each view, alternating between the dense scene and the measured
-scene."""
+"""Number of timed frames per view, alternating between the dense scene and the measured one."""
 
 
 class JudgedViews(NamedTuple):
-    """The views that scenes are drawn and timed in, their photos of the same size in [0, 1], if
-    there are some, and a text on their origin."""
+    """Views to draw and time, their photos of the same size in [0, 1], if any, and a text on their
+    origin."""
 
     views: Views
     photos: list[Example] | None
@@ -51,8 +49,9 @@ class JudgedViews(NamedTuple):
 
 
 def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
-    """At most ``count`` views of a middle size, and a note. They are the views of held-out photos,
-    which are averaged over the areas of pixels, or else those of the
+    """At most ``count`` views of a middle size, and a note.
+
+    They are views of held-out photos, which are reduced by averaging, or else the views of the
     :class:`~pointsplat_ns.pipeline.quality.Judge`. Raises DataError if there are none."""
     note = ""
     if subject.held_out is not None:
@@ -63,22 +62,20 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
             small = views.resized(max(middle.width, middle.height))
             if small is not views:
                 photos = [_averaged(photo, view) for photo, view in zip(photos, small, strict=True)]
-            return JudgedViews(
-                small, photos, f"held-out photos of {subject.photos or 'the dataset'}"
-            ), note
+            origin = f"held-out photos of {subject.photos or 'the dataset'}"
+            return JudgedViews(small, photos, origin), note
         except (SceneError, DataError) as error:
             note = f"there are no held-out photos: {error}"
     source = subject.new_views()
-    return JudgedViews(
-        source.compared().spread(min(count, VIEW_COUNTS.compared)), None, origin_text(source.origin)
-    ), note
+    views = source.compared().spread(min(count, VIEW_COUNTS.compared))
+    return JudgedViews(views, None, origin_text(source.origin)), note
 
 
 def photos_of_one_size(photos: Photos, count: int) -> tuple[Views, list[Example], str]:
     """At most ``count`` photos of one size, their views, and a note on photos of other sizes."""
     shown = [photos[index] for index in spread_indices(len(photos), count)]
     if not shown:
-        raise DataError("no photo is held out")
+        raise DataError("there is no held-out photo")
     sizes = [example.target.shape for example in shown]
     size = max(sizes, key=sizes.count)
     of_size = [example for example in shown if example.target.shape == size]
@@ -89,58 +86,47 @@ def photos_of_one_size(photos: Photos, count: int) -> tuple[Views, list[Example]
     )
     views = Views(viewmats, Ks, first.width, first.height, first.background, first.rasterize_mode)
     others = len(shown) - len(of_size)
-    note = (
-        f"{others} of {len(shown)} held-out photos are of another size and left out"
-        if others
-        else ""
-    )
-    return (
-        views,
-        [example._replace(target=in_unit_range(example.target).float()) for example in of_size],
-        note,
-    )
+    note = f"{others} of {len(shown)} held-out photos have another size: skipped" if others else ""
+    floats = [example._replace(target=in_unit_range(example.target).float()) for example in of_size]
+    return views, floats, note
 
 
 def _averaged(photo: Example, view: View) -> Example:
-    """A photo reduced to a view, by the mean of each area; a pixel counts if half of its area
-    does."""
+    """A photo reduced to the size of a view by averaging; a pixel is valid if half of its area
+    is."""
 
     def reduced(image: Tensor) -> Tensor:
         planes = image.permute(2, 0, 1)[None].float()
-        return torch.nn.functional.interpolate(planes, (view.height, view.width), mode="area")[
-            0
-        ].permute(1, 2, 0)
+        size = (view.height, view.width)
+        return torch.nn.functional.interpolate(planes, size, mode="area")[0].permute(1, 2, 0)
 
-    return Example(
-        view, reduced(photo.target), None if photo.mask is None else reduced(photo.mask) >= 0.5
-    )
+    mask = None if photo.mask is None else reduced(photo.mask) >= 0.5
+    return Example(view, reduced(photo.target), mask)
 
 
 class Measurer:
-    """Judges scenes as every command does, and measures them in the same views: frame times, and
-    errors against photos if there are some. ``views`` is the largest number of views that are
-    timed, and of photos. Raises SceneError if no Gaussian can be drawn; DataError if there are no
-    views, or they are too small for SSIM."""
+    """Judges scenes as every command does, and measures frame times and errors against photos.
+
+    ``views`` is the maximum number of timed views and of photos. Raises SceneError if no Gaussian
+    can be drawn, and DataError if there are no views, or they are too small for SSIM."""
 
     def __init__(self, subject: Subject, views: int):
         need_usable(subject.dense)
         self.subject = subject
         self.dense = subject.dense
         self._dense_ms: float | None = None
-        """Time of a frame of the dense scene, which is measured first: the unit of measured
-        ratios."""
+        """Frame time of the dense scene, which is measured first: the unit of ratios."""
         self.judge = Judge(self.dense, subject.new_views())
         self.judged, self.note = views_to_judge(subject, views)
         shown = self.judged.views
         if min(shown.width, shown.height) < SSIM_WINDOW:
-            raise DataError(
-                f"views are {shown.width} x {shown.height} pixels; expected at least "
-                f"{SSIM_WINDOW} a side"
-            )
+            size = f"{shown.width} x {shown.height} pixels"
+            raise DataError(f"views are {size}; expected at least {SSIM_WINDOW} per side")
 
     def point(self, setting: Setting, scene: Gaussians, seconds: float, show: Progress) -> Point:
-        """The point of a setting, from its scene and the seconds of making it; the dense scene
-        comes first. ``show`` is called with the name of the current task and its share done."""
+        """Measure the point of a setting, from its scene and the duration of making it. The dense
+        scene must come first. ``show`` is called with the name of the current task and its share
+        done."""
         show("comparing", 0.0)
         quality = self.judge.quality(scene)
         assert quality.ssim is not None
@@ -177,7 +163,7 @@ class Measurer:
 
     @torch.no_grad()
     def _speed(self, scene: Gaussians, show: Progress) -> tuple[Speed, float | None]:
-        """The measured ratio of frames, and the cores that other programs used meanwhile."""
+        """Ratio of frame times, and the number of cores that other programs used meanwhile."""
         others = OtherPrograms()
         pairs = []
         views = self.judged.views
@@ -194,7 +180,7 @@ class Measurer:
 
 
 def _timed(scene: Gaussians, view: View) -> float:
-    """Seconds of drawing a view."""
+    """Time to draw a view, seconds."""
     start = now(scene.device)
     render(scene, view)
     return now(scene.device) - start
@@ -202,14 +188,12 @@ def _timed(scene: Gaussians, view: View) -> float:
 
 def machine_text(device: torch.device) -> str:
     """Processor, number of threads, device and version of torch, as text."""
-    # of Linux
     threads = most_threads()
-    about = Path("/proc/cpuinfo")
-    models = (
-        re.findall(r"^model name\s*: *(.*)", about.read_text("utf-8", "replace"), re.M)
-        if about.exists()
-        else []
-    )
+    models = []
+    cpuinfo = Path("/proc/cpuinfo")  # on Linux
+    if cpuinfo.exists():
+        text = cpuinfo.read_text("utf-8", "replace")
+        models = re.findall(r"^model name\s*: *(.*)", text, re.M)
     processor = next(iter(models), "") or platform.processor() or platform.machine()
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
     return (
@@ -219,14 +203,14 @@ def machine_text(device: torch.device) -> str:
 
 
 def busy_note(others: Sequence[float | None]) -> str:
-    """A line of text if other programs disturbed measurements, from the cores that they used during
-    each, which are None where nothing was timed; else empty. A quarter of a core does not change
-    medians."""
+    """Text on measurements disturbed by other programs; empty if there are none. ``others`` are the
+    cores that these used during each measurement; None if nothing was timed. A quarter of a core
+    does not change medians."""
     timed = [used for used in others if used is not None]
     disturbed = [used for used in timed if used + most_threads() > cores() + 0.25]
     if not disturbed:
         return ""
     return (
         f"the machine was busy: while {len(disturbed)} of {len(timed)} points were timed, other "
-        f"programs took up to {max(disturbed):.1f} of {cores()} cores; times are not to be trusted"
+        f"programs took up to {max(disturbed):.1f} of {cores()} cores; times are unreliable"
     )

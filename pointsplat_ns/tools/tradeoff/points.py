@@ -1,4 +1,4 @@
-"""The measurements of a scene, and the JSON that they are written to."""
+"""Measurements of a scene, and their JSON file."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from pointsplat_ns.pipeline.repair_budget import Effort
 from pointsplat_ns.system.files import write_json
 
 Repair = Literal["none", "quick", "thorough", "photos"]
-"""Kinds of repair: none, those of ``compact`` by effort, and ``quick`` with a training on the
-photos after it."""
+"""Kinds of repair: none, the efforts of ``compact``, and its training on photos."""
 
 REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
 EFFORTS: dict[Repair, Effort] = {"quick": "quick", "thorough": "thorough", "photos": "quick"}
-"""The effort of ``compact`` for each repair."""
+"""Effort of ``compact`` by repair."""
 
 DENSE = "dense"
 """Key and method of the dense scene."""
 
 RESULTS = {"json": "tradeoff.json", "page": "tradeoff.html"}
-"""Names of the results in their folder."""
+"""File names of the results."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A way of making a scene smaller: the number of Gaussians kept, a repair, and a method."""
+    """A way to make a scene smaller: count, repair and method."""
 
     count: int
     repair: Repair = "none"
@@ -44,8 +43,7 @@ class ImageMetrics:
 
 
 class Speed(NamedTuple):
-    """Ratio of the dense scene's time of a frame to that of a point: median over views, and
-    quartiles."""
+    """Frame time of the dense scene divided by that of a point: median and quartiles over views."""
 
     median: float
     low: float
@@ -54,39 +52,39 @@ class Speed(NamedTuple):
 
 @dataclass(frozen=True)
 class Point:
-    """The measurement of one way of making a scene smaller."""
+    """The measurement of one setting."""
 
     key: str
-    """Short name, unique in a table and fit for a file's name: ``dense``, ``10pct``,
+    """Short name, unique in a table and valid in a file name: ``dense``, ``10pct``,
     ``10pct_quick``."""
     label: str
-    """The same for people: ``10 %, repaired (quick)``."""
+    """Name to show: ``10 %, repaired (quick)``."""
     command: str
     """The exact command that produces the scene; empty for the dense one."""
     by: str
-    """The method of pruning; ``dense`` for the scene as it is."""
+    """Pruning method; ``dense`` for the dense scene."""
     share: float
-    """Share of the Gaussians kept."""
+    """Number of Gaussians as a share of the dense scene's."""
     gaussians: int
     repair: str
     """Kind of repair, see :data:`Repair`."""
     bytes: int
     """Size of the PLY."""
     against_dense: ImageMetrics
-    """Quality against renders of the dense scene, as every command says it
-    (:mod:`~pointsplat_ns.pipeline.quality`); the dense scene's own PSNR is infinite."""
+    """Quality against renders of the dense scene, as reported by every command
+    (:mod:`~pointsplat_ns.pipeline.quality`); the PSNR of the dense scene is infinite."""
     against_photos: ImageMetrics | None
-    """Quality against held-out photos; None where there are none."""
+    """Quality against held-out photos; None without photos."""
     speed: Speed
     frame_ms: float
-    """Milliseconds of a frame: the dense scene's at the start, divided by the median speed, so that
-    points are comparable when the machine gets slower."""
+    """Frame time, ms: the dense scene's time at the start, divided by the median speed, so that
+    points stay comparable when the machine slows down."""
     fill: float
-    """Mean number of Gaussians that viewers draw on a pixel."""
+    """Mean number of Gaussians that viewers draw per pixel."""
     seconds: float
     """Duration of making the scene."""
     others_cores: float | None = None
-    """Cores that other programs used during the timing; None if that is not known."""
+    """Number of cores that other programs used during timing; None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -111,17 +109,17 @@ class Tradeoff:
     views_origin: str
     """Origin of the views."""
     judged_in: str
-    """Number and size of the views that scenes are judged in, as text."""
+    """Number and size of the judge's views, as text."""
     width: int
     height: int
     """Size of the pictures, in pixels."""
     points: tuple[Point, ...]
     notes: tuple[str, ...]
-    """Lines of text for the reader, such as on a busy machine."""
+    """Notes for the reader, such as on a busy machine."""
     recommended: str
     """``key`` of the recommended point."""
     why: str
-    """Text on the reason for it."""
+    """Reason for the recommendation, as text."""
 
     def point(self, key: str) -> Point:
         """The point with a key. Raises KeyError if there is no such point."""

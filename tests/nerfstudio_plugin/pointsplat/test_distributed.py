@@ -120,7 +120,7 @@ def work(rank: int, folder: Path, port: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def together(tmp_path_factory):
+def together(tmp_path_factory, quick):
     """What the two processes found, and what one process finds with two scenes an update."""
     folder = tmp_path_factory.mktemp("parallel")
     (folder / "rooms").mkdir()
@@ -185,6 +185,9 @@ def test_each_process_evaluates_its_share_and_the_first_alone_writes(together):
         "config.yml",
         "refiner.safetensors",
         f"step-{UPDATES - 1:09d}.ckpt",
+        "training.csv",
+        "training.png",
+        "views.png",
     ]
     assert found[1]["files"] == []
 

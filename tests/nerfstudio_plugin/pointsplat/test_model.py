@@ -237,6 +237,8 @@ def test_a_report_has_the_settings_of_the_network_and_of_pruning(report):
         "encoder": "dual",
         "use_appearance": True,
         "use_position": True,
+        "norm": "scene",
+        "means_reach": 0.05,
         "units": "scene",
         "stem": "conv",
         "raw_inputs": False,

@@ -7,6 +7,7 @@ import torch
 
 from making import box_room, dense_config, equal, small_config, small_refiner
 from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.nerfstudio_plugin import console
 from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.pointsplat import pieces
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pieces import ScenePiece, read_piece
@@ -119,7 +120,7 @@ def test_what_is_not_seen_is_left_out_in_one_line_and_what_is_small_stays_whole(
     write_ply(box_room(1)[:50], tmp_path / "few.ply")
     write_ply(room.replace(opacities=room.opacities - 1e3), tmp_path / "clear.ply")
     write_ply(room.replace(means=room.means * torch.nan), tmp_path / "broken.ply")
-    with mock.patch.object(pieces.CONSOLE, "log") as log:
+    with mock.patch.object(console.CONSOLE, "log") as log:
         manager = manager_of(tmp_path)
         names = {manager.scenes[manager.scene_at(step)].name.split("/")[0] for step in range(15)}
     assert names == {"room", "few"}

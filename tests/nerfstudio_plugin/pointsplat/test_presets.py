@@ -29,7 +29,7 @@ FIELDS = {
     "global_norm": (None, 2.0),
     "pipeline.datamanager.images_per_step": (2, 2),
     "pipeline.model.by": ("paper", "authors"),
-    "pipeline.model.keep": (0.3, 0.3),
+    "pipeline.model.keep": ("30%", "30%"),
     "pipeline.model.raw_inputs": (True, True),
     "pipeline.model.norm": ("batch", "batch"),
     "pipeline.model.enc_depths": (None, (2, 2, 2, 6, 2)),

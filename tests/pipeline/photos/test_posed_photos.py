@@ -99,9 +99,7 @@ def test_turned_axes_and_other_scales_of_poses_are_found_and_named(
     others = invert_rigid(flip_camera_axes(poses) if axes else poses)
     write_sparse(replace(views, viewmats=others), tmp_path / "sparse/0")
     assert same_poses(read(scene, folder).views, views, 1e-5 if axes else 2e-3)
-    change = (
-        "axes x, y, z of the scene are x, z, -y of the poses, camera axes y and z turned around"
-    )
+    change = "axes x, y, z of the scene are x, z, -y of the poses, camera axes y and z flipped"
     assert (
         f"poses are moved into the frame of the scene: {change if axes else 'positions times 2.5'}"
         in said.text
@@ -153,7 +151,7 @@ def test_photos_of_another_scene_are_refused_with_their_psnr(scene, views, tmp_p
     folder = write_photos(other.replace(features_dc=colors), views, tmp_path / "images")
     write_sparse(views, tmp_path / "sparse/0")
     with pytest.raises(
-        DataError, match=r"unlike the photos in the frame .* dB PSNR in 8 photos.*--poses"
+        DataError, match=r"do not match the photos in the frame .* dB PSNR in 8 photos.*--poses"
     ):
         read(scene, folder)
 
@@ -168,7 +166,7 @@ def test_photos_that_fit_worst_are_named_and_left_out(scene, views, tmp_path, sa
         14,
         2,
     )  # no other photo is held out in its place
-    [line] = [line for line in said.messages if "fit worst are left out" in line]
+    [line] = [line for line in said.messages if "match the scene worst are left out" in line]
     assert "frame_3.png (" in line and "frame_16.png (" in line and line.count("dB") == 2
 
 
@@ -183,9 +181,7 @@ def test_photos_that_cannot_be_read_are_named_and_left_out(scene, views, tmp_pat
     found = read(scene, folder)
     assert (len(found.training), len(found.held_out)) == (14, 2)
     [line] = [
-        line
-        for line in said.messages
-        if line.startswith("photos that cannot be used are left out: ")
+        line for line in said.messages if line.startswith("photos that are unusable are left out: ")
     ]
     assert (
         f"{first}: cannot be read as a photo" in line

@@ -15,7 +15,7 @@ from making import cloud, run_of, views_from_within
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.geometry.transforms import direction_of, invert_rigid
-from pointsplat_ns.pipeline.photos.posed_scene import read_found
+from pointsplat_ns.pipeline.photos.posed_scene import read_scene_and_cameras
 from pointsplat_ns.scene.camera_files import read_named_views
 from pointsplat_ns.scene.rotation import Similarity
 from pointsplat_ns.tools.placing import run_frame
@@ -52,9 +52,9 @@ def test_the_transforms_beside_scene_or_poses_are_applied(beside, scene, views, 
     with pytest.raises(
         ps.DataError, match=r"0 of 6 cameras see anything of the scene.*dataparser_transforms.json"
     ):
-        read_found(tmp_path / "scene" / "room.ply", path)
+        read_scene_and_cameras(tmp_path / "scene" / "room.ply", path)
     written(transforms, tmp_path / beside / "dataparser_transforms.json")
-    dense, found, _ = read_found(tmp_path / "scene" / "room.ply", path)
+    dense, found, _ = read_scene_and_cameras(tmp_path / "scene" / "room.ply", path)
     assert len(dense) == len(scene)
     torch.testing.assert_close(
         found.viewmats.float(), views.viewmats.float(), rtol=0, atol=1e-3
@@ -62,8 +62,8 @@ def test_the_transforms_beside_scene_or_poses_are_applied(beside, scene, views, 
     ps.save(
         scene.replace(means=scene.means + 1000), tmp_path / "scene" / "room.ply", overwrite=True
     )
-    with pytest.raises(ps.DataError, match="dataparser_transforms.json is of another run"):
-        read_found(tmp_path / "scene" / "room.ply", path)
+    with pytest.raises(ps.DataError, match="dataparser_transforms.json belongs to another run"):
+        read_scene_and_cameras(tmp_path / "scene" / "room.ply", path)
 
 
 def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls, tmp_path):
@@ -77,7 +77,7 @@ def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls
     original = nerfstudio(replace(known, viewmats=invert_rigid(back @ poses)))
     path = written(original, tmp_path / "transforms.json")
     for named in (run, run / "config.yml", next((run / "nerfstudio_models").glob("*.ckpt"))):
-        dense, found, _ = read_found(named, path)
+        dense, found, _ = read_scene_and_cameras(named, path)
         assert dense.antialiased
         torch.testing.assert_close(
             found.viewmats.float(), known.viewmats.float(), rtol=0, atol=1e-5
@@ -107,16 +107,16 @@ def test_photos_that_lie_where_the_file_says_tell_a_wrong_frame(layout, scene, v
         (tmp_path / "dslr" / "nerfstudio").mkdir(exist_ok=True)
         return written(content, tmp_path / "dslr" / "nerfstudio" / "transforms.json")
 
-    _, found, _ = read_found(scene, poses_of(views))
+    _, found, _ = read_scene_and_cameras(scene, poses_of(views))
     assert len(found) == len(views)
     with pytest.raises(
         ps.DataError,
         match=r"no more like the photos of their views than like others \(.* dB PSNR in 6",
     ):
-        read_found(scene, poses_of(turned_about(views)))
+        read_scene_and_cameras(scene, poses_of(turned_about(views)))
     for photo in photos.iterdir():
         photo.write_bytes(b"no photo")
-    read_found(scene, poses_of(turned_about(views)))  # nothing to compare with
+    read_scene_and_cameras(scene, poses_of(turned_about(views)))  # nothing to compare with
 
 
 def test_no_photo_outside_of_the_folder_of_poses_is_opened(scene, views, tmp_path):

@@ -79,7 +79,7 @@ def test_poses_of_data_count_where_they_are_asked_for_and_no_photo_is_opened_bef
     monkeypatch.setattr(
         posed_scene, "read_reduced", lambda *given: opened.append(given) or read(*given)
     )
-    assert known(path) is None and "its frame may be another one; --poses" in said.text
+    assert known(path) is None and "its frame may differ; --poses" in said.text
     assert not opened
     assert same(known(path, str(named)), views) and len(opened) == len(views)
     write_photos(scene, views[torch.arange(len(views)).flip(0).tolist()], tmp_path / "images")

@@ -139,7 +139,7 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
     means[9] = torch.tensor([0.0, -1e9, 0.0])
     with caplog.at_level(logging.WARNING):
         path = ps.write_page(scene.replace(means=means), tmp_path / "page.html", ["the ball"])
-    assert "the ball: 3 Gaussians, very far away or not finite, are not in the page" in caplog.text
+    assert "the ball: 3 distant or non-finite Gaussians are left out of the page" in caplog.text
     [shown] = scenes_in(path, tmp_path)
     assert len(shown) == 197 and shown.means.abs().max() < 2047
 

@@ -89,7 +89,7 @@ def test_folders_of_others_are_left_alone(tmp_path):
     (tmp_path / "photos" / "cat.png").touch()
     (tmp_path / "file").touch()
     refused = {
-        "photos": "holds cat.png; expected a new folder",
+        "photos": "contains cat.png; expected a new folder",
         "file": "expected the name of a folder",
         "film.avi": "cannot write a .avi file",
         "file/film.mp4": "cannot be written",

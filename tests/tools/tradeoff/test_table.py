@@ -165,7 +165,7 @@ def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(room, room
 def test_pictures_too_small_for_ssim_are_refused(measured, room_views, monkeypatch):
     views = replace(room_views, width=10)
     monkeypatch.setattr(view_provider.Sampler, "views", lambda sampler, count, *_, **options: views)
-    with pytest.raises(DataError, match="views are 10 x 36 pixels; expected at least 11 a side"):
+    with pytest.raises(DataError, match="views are 10 x 36 pixels; expected at least 11 per side"):
         measured()
 
 
@@ -260,7 +260,7 @@ def test_the_dense_scene_comes_with_the_next_best_and_its_cost(photos, loss):
     )
     assert best is dense and why.startswith(f"no faster point {limit}")
     assert f"; the best, the b, {loss} 90 Gaussians, 0.900 kB in place of 5.00 kB, " in why
-    assert "50 ms a frame in place of 100, made in 3 s" in why
+    assert "50 ms per frame in place of 100, made in 3 s" in why
     assert "the best" not in recommend([dense], 0.5)[1]
     for trusted, what in (
         (True, "fastest point"),
