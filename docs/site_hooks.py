@@ -24,6 +24,7 @@ ELSEWHERE = {
     "CHANGELOG.md": "project/changelog.md",
     "pointsplat_ns/refinement/pretrained/CARD.md": "project/refiner.md",
     "pointsplat_ns/refinement/pretrained/FEEDBACK.md": "project/feedback.md",
+    "pointsplat_ns/refinement/pretrained/SELECTION.md": "project/selection.md",
 }
 """Pages outside docs/, by path in the repository, and where the site has them."""
 

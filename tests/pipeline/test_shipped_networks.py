@@ -14,7 +14,7 @@ def test_the_network_that_ships_for_selections_brings_a_room_closer_that_it_neve
     assert refiner.settings.by == "paper" and refiner.network.config.units == "local"
     assert refiner.source.stat().st_size <= 10e6
     room = ps.example_room()
-    views = ps.sample_views(room, 4, width=160, height=120)
+    views = ps.sample_views(room, 12, width=160, height=120)
     renders = [ps.render(room, view) for view in views]
 
     def psnr(scene: ps.Gaussians) -> float:
@@ -25,8 +25,8 @@ def test_the_network_that_ships_for_selections_brings_a_room_closer_that_it_neve
         return float(torch.stack(each).mean())
 
     small = prune(room, 0.1, by)
-    # 2 to 3 dB were measured
-    assert psnr(ps.refine(small, refiner, kept=0.1)) > psnr(small) + 1.0
+    # at 320 x 240, 6.8 and 3.4 dB were measured
+    assert psnr(ps.refine(small, refiner, kept=0.1)) > psnr(small) + 2.0
 
 
 def test_the_network_that_ships_for_merging_is_another():
