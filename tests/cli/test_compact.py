@@ -135,7 +135,7 @@ def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, cap
     run("compact", "my room.ply", "--for", goal)
     said = capsys.readouterr().out
     assert "all 150 Gaussians remain" in said and len(read_scene(file)) == 150
-    assert page.exists() == wanted.page and ("smaller --keep lowers it" in said) == (
+    assert page.exists() == wanted.page and ("use a smaller --keep" in said) == (
         goal == "headset"
     )
     if wanted.page:
@@ -192,7 +192,7 @@ def test_what_cannot_be_used_is_refused_in_one_line_and_early(
     for scene, options, wanted in (
         (ply, ("--refiner", ply), "expected a trained pointsplat run"),
         (ply, ("-o", tmp_path / "small.obj"), ".spz, .sog"),
-        (ply, ("--refiner", tmp_path / "flat.safetensors"), "SH degree 1; the refiner"),
+        (ply, ("--refiner", tmp_path / "flat.safetensors"), "SH degree 1, but the refiner"),
         (tmp_path / "gone.ply", ("--refiner", helps), "gone.ply: no such file"),
         (ply, ("--seconds", "-1"), "the time to repair is -1 s; expected 0 or more"),
         (ply, ("--keep", "half"), "keep is 'half'"),

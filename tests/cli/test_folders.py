@@ -85,13 +85,13 @@ def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
             "--poses is for one scene; rooms is a folder of scenes",
         ),
         (("compact", "rooms", "-o", "rooms"), "rooms: contains the scenes themselves"),
-        (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs is for a folder"),
+        (("compact", "rooms/room1.ply", "--jobs", "2"), "a single scene; --jobs is for a folder"),
         (("compact", "empty"), "empty: no scene below it"),
         (("convert", "rooms", "out"), "compact and info accept a folder of scenes"),
         (("prune", "rooms"), "compact and info accept a folder of scenes"),
         (("info", "empty"), "empty: no scene below it"),
-        (("lod", "rooms"), "take a folder of scenes"),
-        (("clean", "rooms"), "take a folder of scenes"),
+        (("lod", "rooms"), "accept a folder of scenes"),
+        (("clean", "rooms"), "accept a folder of scenes"),
     ],
 )
 def test_what_does_not_fit_a_folder_is_refused_in_one_line(
