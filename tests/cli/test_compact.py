@@ -135,9 +135,7 @@ def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, cap
     run("compact", "my room.ply", "--for", goal)
     said = capsys.readouterr().out
     assert "all 150 Gaussians remain" in said and len(read_scene(file)) == 150
-    assert page.exists() == wanted.page and ("use a smaller --keep" in said) == (
-        goal == "headset"
-    )
+    assert page.exists() == wanted.page and ("use a smaller --keep" in said) == (goal == "headset")
     if wanted.page:
         [shown] = parts_of(page).data["flight"]["scenes"]
         assert (shown["name"], shown["amount"]) == ("my-room", "150 Gaussians")

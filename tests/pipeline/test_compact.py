@@ -161,7 +161,9 @@ def test_a_degree_above_the_networks_is_refused_before_anything_is_done(scene, v
     refiner = trained(tiny_refiner(sh_degree=0))
     with monkeypatch.context() as patch:
         patch.setattr(compact_module, "prune_scene", None)
-        with pytest.raises(SceneError, match="has SH degree 1; .* at most 0; cut it with --sh 0"):
+        with pytest.raises(
+            SceneError, match="has SH degree 1, .* at most 0; cut the SH bands with --sh 0"
+        ):
             compacted(scene, refiner, views, sh="1")
     assert compacted(scene, refiner, views, sh="0").scene.sh_degree == 0
     strong = scene.replace(

@@ -318,14 +318,14 @@ def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, 
     assert dense > pruned + 1
 
 
-TEXT = r"held-out photos: ([\d.]+) -> ([\d.]+) dB PSNR in 3 photos, of the dense scene ([\d.]+) dB"
+TEXT = r"held-out photos: ([\d.]+) -> ([\d.]+) dB PSNR in 3 photos, the dense scene ([\d.]+) dB"
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"views": "none"}, "photos need the file with their poses"),
-        ({"data": "data"}, "the data of a run, but photos are read from"),
+        ({"views": "none"}, "photos need a camera file with their poses"),
+        ({"data": "data"}, "data of a run, but photos are read from"),
         ({"views": "run.json"}, "no such file"),
     ],
 )

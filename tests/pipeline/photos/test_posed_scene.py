@@ -111,7 +111,7 @@ def test_photos_that_lie_where_the_file_says_tell_a_wrong_frame(layout, scene, v
     assert len(found) == len(views)
     with pytest.raises(
         ps.DataError,
-        match=r"no more like the photos of their views than like others \(.* dB PSNR in 6",
+        match=r"match the photos of their views no better than other photos \(.* dB PSNR in 6",
     ):
         read_scene_and_cameras(scene, poses_of(turned_about(views)))
     for photo in photos.iterdir():

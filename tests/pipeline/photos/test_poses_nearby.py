@@ -83,7 +83,7 @@ def test_poses_of_data_count_where_they_are_asked_for_and_no_photo_is_opened_bef
     assert not opened
     assert same(known(path, str(named)), views) and len(opened) == len(views)
     write_photos(scene, views[torch.arange(len(views)).flip(0).tolist()], tmp_path / "images")
-    with pytest.raises(ps.DataError, match="no more like the photos of their views than like"):
+    with pytest.raises(ps.DataError, match="match the photos of their views no better than"):
         known(path, str(named))
 
 

@@ -223,7 +223,7 @@ def test_older_tiles_need_force_and_stay_when_writing_fails(tmp_path, monkeypatc
     ps.save(normal_scene(20), tmp_path / "room.ply")
     for options, words in (
         (("--tiles", "--stream"), "either a stream or 3D Tiles"),
-        (("--at", "1,2"), "with tiles alone"),
+        (("--at", "1,2"), "a place on the Earth needs tiles"),
         (("--tiles", "--at", "Paris"), "expected a UTM zone"),
         (("--tiles", "-o", tmp_path / "a.rad"), "expected the name of a folder"),
     ):
