@@ -151,7 +151,7 @@ def some_lpips(request, monkeypatch) -> bool:
 def make_refined_run() -> Callable:
     """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved``
     to every opacity logit and nothing else, and gives its folder."""
-    from pointsplat_ns.refinement import Refiner, preset
+    from pointsplat_ns.refinement import Refiner, refiner_preset
 
     def make(
         folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model
@@ -160,7 +160,7 @@ def make_refined_run() -> Callable:
         config.pipeline.datamanager.eval_scenes = eval_scenes
         config.write_config()
         torch.manual_seed(SEED)
-        refiner = Refiner(preset("tiny"))
+        refiner = Refiner(refiner_preset("tiny"))
         with torch.no_grad():
             [*refiner.heads.mlps["opacities"].modules()][-1].bias.fill_(moved)
         state = {f"_model.refiner.{name}": value for name, value in refiner.state_dict().items()}

@@ -61,7 +61,10 @@ class Junk:
         undrawable = self.undrawable[:count]
         unseen = self.unseen[: count - len(undrawable)]
         return Junk(
-            undrawable, unseen, self.floating[: count - len(undrawable) - len(unseen)], self.places
+            undrawable=undrawable,
+            unseen=unseen,
+            floating=self.floating[: count - len(undrawable) - len(unseen)],
+            places=self.places,
         )
 
     @property
@@ -150,7 +153,12 @@ def find_junk(
         try:
             views = _views_all_around(part)
         except DataError:
-            return Junk(undrawable.cpu(), drawn[:0].cpu(), drawn[:0].cpu(), 0)
+            return Junk(
+                undrawable=undrawable.cpu(),
+                unseen=drawn[:0].cpu(),
+                floating=drawn[:0].cpu(),
+                places=0,
+            )
         has_pixels = torch.zeros_like(drawn, dtype=torch.bool)
         for done, pixels in enumerate(each_view(part, views, pixels_of)):
             has_pixels |= pixels > 0
@@ -164,7 +172,12 @@ def find_junk(
         visible[drawn] |= shown
         scores, floats = scores.sort(stable=True)
         floats = floats[scores < strength]
-    return Junk(undrawable.cpu(), order[~visible[order]].cpu(), floats.cpu(), places)
+    return Junk(
+        undrawable=undrawable.cpu(),
+        unseen=order[~visible[order]].cpu(),
+        floating=floats.cpu(),
+        places=places,
+    )
 
 
 def floating_scores(

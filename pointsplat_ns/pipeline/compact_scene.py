@@ -79,7 +79,13 @@ def compact_scene(
         comparison = Comparison(dense_on_device, views)
     except DataError as error:
         uncompared = str(error)
-    context = Context(dense_on_device, views, comparison, uncompared, progress)
+    context = Context(
+        dense=dense_on_device,
+        views=views,
+        comparison=comparison,
+        uncompared=uncompared,
+        progress=progress,
+    )
     reference = context.reference
     results = [
         StageResult(

@@ -108,7 +108,7 @@ def repair(
     examples = _examples(dense, views, budget.growth, run.count)
     scenes = saving_state(optimised(scene, feedback, examples, choose), run.count)
     last = run.take(scene, scenes, progress)
-    return Repaired(last, run.count, run.seconds, run.interrupted)
+    return Repaired(scene=last, steps=run.count, seconds=run.seconds, interrupted=run.interrupted)
 
 
 @dataclass

@@ -55,7 +55,7 @@ class Stage(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Refine:
+class Refine(Stage):
     """One forward pass of a trained network."""
 
     refiner: TrainedRefiner
@@ -79,7 +79,7 @@ class Refine:
 
 
 @dataclass(frozen=True, eq=False)
-class Repair:
+class Repair(Stage):
     """Steps towards renders of the dense scene."""
 
     budget: RepairBudget
@@ -117,7 +117,7 @@ class Repair:
 
 
 @dataclass(frozen=True, eq=False)
-class TrainOnPhotos:
+class TrainOnPhotos(Stage):
     """Training on photos, accepted by its PSNR in photos."""
 
     photos: Photos

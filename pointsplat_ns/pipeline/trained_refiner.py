@@ -15,7 +15,13 @@ import torch
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.pipeline.options import default_device
 from pointsplat_ns.pruning import PruneSettings, method_named
-from pointsplat_ns.refinement import Refiner, WeightsError, preset, read_metadata, read_refiner
+from pointsplat_ns.refinement import (
+    Refiner,
+    WeightsError,
+    read_metadata,
+    read_refiner,
+    refiner_preset,
+)
 from pointsplat_ns.refinement.weights import shipped_refiner
 from pointsplat_ns.scene.checkpoints import load_checkpoint
 from pointsplat_ns.scene.discovery import find_runs_and_plys, shown_scene
@@ -123,7 +129,9 @@ def load_refiner(
         run = open_refiner_run(path, need_data=False)
         network, settings = _read_run(run)
         options = run.model_fields
-    return TrainedRefiner(network.to(device).eval(), settings, path, options)
+    return TrainedRefiner(
+        network=network.to(device).eval(), settings=settings, source=path, options=options
+    )
 
 
 def refine(
@@ -213,7 +221,9 @@ def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
     """The network in the checkpoint of a ``pointsplat`` run, and its pruning settings."""
     try:
-        network = Refiner(preset(run.model_fields["size"], **network_options(run.model_fields)))
+        network = Refiner(
+            refiner_preset(run.model_fields["size"], **network_options(run.model_fields))
+        )
         settings = settings_from(run.model_fields)
         state = load_checkpoint(run.checkpoint)["pipeline"]
         prefix = "_model.refiner."

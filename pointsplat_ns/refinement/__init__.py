@@ -1,6 +1,11 @@
 """The refiner: dual-branch encoder, Point Transformer V3 in plain torch, residual heads."""
 
-from pointsplat_ns.refinement.config import PRESETS, RefinerConfig, RefinerConfigError, preset
+from pointsplat_ns.refinement.config import (
+    PRESETS,
+    RefinerConfig,
+    RefinerConfigError,
+    refiner_preset,
+)
 from pointsplat_ns.refinement.refiner import Refiner
 from pointsplat_ns.refinement.structure import Structure
 from pointsplat_ns.refinement.weights import WeightsError, read_metadata, read_refiner, save_refiner
@@ -12,7 +17,7 @@ __all__ = [
     "RefinerConfigError",
     "Structure",
     "WeightsError",
-    "preset",
+    "refiner_preset",
     "read_metadata",
     "read_refiner",
     "save_refiner",

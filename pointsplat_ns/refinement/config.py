@@ -252,7 +252,6 @@ def refiner_preset(name: str, **changes: Any) -> RefinerConfig:
     return RefinerConfig(**{**PRESETS[name], **units, **changes})
 
 
-preset = refiner_preset
 """Its name within the package."""
 
 

@@ -85,10 +85,10 @@ def cut_scene(means: Tensor, most: int, seed: int = 0) -> SceneCut:
 
     build(torch.arange(len(along), **INDICES))
     return SceneCut(
-        torch.stack(directions) if directions else torch.zeros(0, 3, **DOUBLES),
-        torch.tensor(thresholds, **DOUBLES),
-        torch.tensor(children, **INDICES).view(-1, 2),
-        pieces,
+        directions=torch.stack(directions) if directions else torch.zeros(0, 3, **DOUBLES),
+        thresholds=torch.tensor(thresholds, **DOUBLES),
+        children=torch.tensor(children, **INDICES).view(-1, 2),
+        count=pieces,
     )
 
 

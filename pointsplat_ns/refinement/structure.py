@@ -202,7 +202,14 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
             orders = [_coarser_order(one, cluster) for one, _ in orders]
     # in memory order, which does not depend on the order of the scene
     local = local_units(scene[order]) if config.units == "local" else None
-    return Structure(cube, order, _invert(order), levels, structure_key(config), local=local)
+    return Structure(
+        cube=cube,
+        order=order,
+        inverse=_invert(order),
+        levels=levels,
+        built_for=structure_key(config),
+        local=local,
+    )
 
 
 def neighbour_pairs(cells: Tensor) -> KernelMap:

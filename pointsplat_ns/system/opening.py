@@ -29,12 +29,6 @@ def open_regular(path: Path | str) -> BinaryIO:
         raise
 
 
-def read_regular(path: Path | str) -> bytes:
-    """All bytes of a regular file. Raises OSError as :func:`open_regular`."""
-    with open_regular(path) as stream:
-        return stream.read()
-
-
 def _need_regular(path: str, found: os.stat_result) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), path)

@@ -222,7 +222,7 @@ def compact_folder(
         claim(target)
     _describe(target, record, force)
     drawn = (page, sheet) != (None, None)
-    work = _Compacting(options, refiner, record, drawn, force)
+    work = _Compacting(options=options, refiner=refiner, record=record, drawn=drawn, force=force)
     results: dict[str, SceneResult] = {}
     try:
         with progress_bar(progress) as report, Workers(work, jobs) as workers:
@@ -266,7 +266,9 @@ class _Task:
     def result(
         self, status: Literal["done", "done before", "failed", "open"], **facts: Any
     ) -> SceneResult:
-        return SceneResult(self.name, str(self.source), str(self.output), status, **facts)
+        return SceneResult(
+            name=self.name, source=str(self.source), output=str(self.output), status=status, **facts
+        )
 
     @property
     def folder(self) -> Path:

@@ -16,7 +16,7 @@ from making import ball, same
 from pointsplat_ns.cli.compact import GOALS
 from pointsplat_ns.pipeline import quality
 from pointsplat_ns.pruning import METHODS, prune
-from pointsplat_ns.refinement import Refiner, preset, save_refiner
+from pointsplat_ns.refinement import Refiner, refiner_preset, save_refiner
 from pointsplat_ns.scene.discovery import find_scenes
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import read_ply, write_ply
@@ -43,7 +43,7 @@ def ply(tmp_path_factory) -> Path:
 def helps(tmp_path_factory) -> Path:
     """A file with a refiner that adds 0.05 to every log-scale."""
     torch.manual_seed(1)
-    refiner = Refiner(preset("tiny"))
+    refiner = Refiner(refiner_preset("tiny"))
     with torch.no_grad():
         [*refiner.heads.mlps["scales"].modules()][-1].bias.fill_(0.05)
     save_refiner(
@@ -185,7 +185,7 @@ def test_what_cannot_be_used_is_refused_in_one_line_and_early(
     monkeypatch.setattr(
         "pointsplat_ns.pipeline.compact_scene.prune_scene", None
     )  # a call of it would be no error of ours
-    save_refiner(Refiner(preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
+    save_refiner(Refiner(refiner_preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
     shown = tmp_path / "shown"
     for scene, options, wanted in (
         (ply, ("--refiner", ply), "expected a trained pointsplat run"),

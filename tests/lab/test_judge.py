@@ -26,7 +26,7 @@ from making import box_room, move_zero_layers, run_of
 from peers import peer
 from pointsplat_ns.cli import main
 from pointsplat_ns.pruning.merging import MERGING, merge
-from pointsplat_ns.refinement import Refiner, preset, save_refiner
+from pointsplat_ns.refinement import Refiner, refiner_preset, save_refiner
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.scene.reading import read_scene
 
@@ -208,8 +208,10 @@ def test_a_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, t
 def test_a_refiner_gains_what_it_brings_closer_an_untrained_one_nothing(small, tmp_path):
     torch.manual_seed(0)
     about = {"by": "opacity", "keep": "0.5"}
-    save_refiner(Refiner(preset("tiny")), tmp_path / "untrained.safetensors", about)
-    save_refiner(move_zero_layers(Refiner(preset("tiny"))), tmp_path / "moved.safetensors", about)
+    save_refiner(Refiner(refiner_preset("tiny")), tmp_path / "untrained.safetensors", about)
+    save_refiner(
+        move_zero_layers(Refiner(refiner_preset("tiny"))), tmp_path / "moved.safetensors", about
+    )
     asked = tuple(f"{name}={tmp_path / name}.safetensors" for name in ("untrained", "moved"))
     options = {"keep": (0.5, 0.25), "by": ("opacity",), "width": 64, "views": 2}
     refiners.main((small,), asked, **options, json_path=tmp_path / "rows.json")
@@ -226,7 +228,9 @@ def test_a_refiner_gains_what_it_brings_closer_an_untrained_one_nothing(small, t
 def test_a_refinement_is_measured_beside_the_best_constant(small, tmp_path):
     """Also, what is measured is not measured again, and the page has a row for each way."""
     about = {"keep": 0.25, "by": "paper"}
-    save_refiner(Refiner(preset("tiny", units="local")), tmp_path / "net.safetensors", about)
+    save_refiner(
+        Refiner(refiner_preset("tiny", units="local")), tmp_path / "net.safetensors", about
+    )
     found = tmp_path / "rows.json"
 
     def measure(*asked: str) -> list[dict]:

@@ -8,7 +8,7 @@ import torch
 
 from making import cloud, same, small_refiner
 from pointsplat_ns.geometry.transforms import rotation_matrices
-from pointsplat_ns.refinement import RefinerConfigError, preset
+from pointsplat_ns.refinement import RefinerConfigError, refiner_preset
 from pointsplat_ns.refinement.local_units import (
     FEWEST_SIZES,
     NEIGHBOURS,
@@ -145,11 +145,11 @@ def test_refining_a_piece_alone_changes_little_away_from_the_cut():
 
 def test_the_encoder_that_concatenates_is_refused():
     with pytest.raises(RefinerConfigError, match="encoder 'dual'"):
-        preset("tiny", units="local", encoder="concat")
+        refiner_preset("tiny", units="local", encoder="concat")
 
 
 def test_a_preset_with_local_units_normalises_each_point_by_itself():
-    config = preset("tiny", units="local")
+    config = refiner_preset("tiny", units="local")
     assert (config.norm, config.means_reach) == ("layer", 0.5)
-    assert preset("tiny", units="local", norm="scene").norm == "scene"
-    assert preset("tiny").norm == "scene"
+    assert refiner_preset("tiny", units="local", norm="scene").norm == "scene"
+    assert refiner_preset("tiny").norm == "scene"

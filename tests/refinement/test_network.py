@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from making import move_zero_layers, normal_scene
-from pointsplat_ns.refinement import Refiner, preset, sparse_ops
+from pointsplat_ns.refinement import Refiner, refiner_preset, sparse_ops
 from pointsplat_ns.refinement.network import (
     BatchNorm,
     Block,
@@ -83,7 +83,7 @@ def test_raw_features_are_the_numbers_of_the_scene_in_a_unit_cube():
         features.quats, usual.quats
     )
     seen = []
-    refiner = Refiner(preset("tiny", raw_inputs=True)).eval()
+    refiner = Refiner(refiner_preset("tiny", raw_inputs=True)).eval()
     refiner.encoder.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
     refiner(scene)
     assert torch.equal(seen[0].opacities.sort(dim=0).values, features.opacities.sort(dim=0).values)
@@ -121,7 +121,7 @@ def test_patches_attend_within_themselves_and_the_last_borrows(n, patch):
 
 
 def test_points_of_a_cell_get_the_dense_convolution_of_their_mean():
-    config = preset("full", grid=4)
+    config = refiner_preset("full", grid=4)
     means = torch.rand(40, 3, generator=seeded())
     structure = build_structure(normal_scene(40).replace(means=means), config)
     level = structure.levels[0]
@@ -148,7 +148,7 @@ def test_points_of_a_cell_get_the_dense_convolution_of_their_mean():
 
 def test_drop_path_acts_in_training_only_and_keeps_the_mean():
     torch.manual_seed(0)
-    block = Block(8, 2, preset("tiny"), drop_path=0.4)
+    block = Block(8, 2, refiner_preset("tiny"), drop_path=0.4)
     x = torch.ones(20000, 1)
     dropped = block.train()._drop(x)
     assert set(dropped.unique().tolist()) == {0.0, torch.tensor(1 / 0.6).item()}
@@ -212,7 +212,7 @@ def test_segments_are_reduced_as_by_a_loop_and_pass_gradcheck(segment, reduce):
 def test_the_refiner_gives_the_same_in_pieces_of_any_size(size, monkeypatch):
     scene = normal_scene(700, dtype=torch.float64)
     torch.manual_seed(0)
-    refiner = move_zero_layers(Refiner(preset(size, patch=100)).double())
+    refiner = move_zero_layers(Refiner(refiner_preset(size, patch=100)).double())
     scenes = []
     grads = []
     for cells in (2**30, 2**13):

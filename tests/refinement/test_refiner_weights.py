@@ -16,9 +16,9 @@ from pointsplat_ns.refinement import (
     Refiner,
     RefinerConfigError,
     WeightsError,
-    preset,
     read_metadata,
     read_refiner,
+    refiner_preset,
     save_refiner,
 )
 from pointsplat_ns.refinement.weights import REFINER_FORMAT
@@ -26,7 +26,7 @@ from pointsplat_ns.refinement.weights import REFINER_FORMAT
 
 def trained(**changes) -> Refiner:
     torch.manual_seed(0)
-    return move_zero_layers(Refiner(preset("tiny", enc_depths=(1, 1, 1), **changes)))
+    return move_zero_layers(Refiner(refiner_preset("tiny", enc_depths=(1, 1, 1), **changes)))
 
 
 @pytest.mark.parametrize(
@@ -217,11 +217,11 @@ def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
 )
 def test_contradictory_settings_are_refused_by_name(changes, message):
     with pytest.raises(RefinerConfigError, match=re.escape(message)):
-        preset("tiny", **changes)
+        refiner_preset("tiny", **changes)
 
 
 def test_an_unknown_size_is_refused():
     with pytest.raises(
         PointSplatError, match="no refiner size 'huge'; expected one of full, small, tiny"
     ):
-        preset("huge")
+        refiner_preset("huge")

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from making import normal_scene
-from pointsplat_ns.refinement import preset
+from pointsplat_ns.refinement import refiner_preset
 from pointsplat_ns.refinement.structure import (
     FINE_BITS,
     HALF_KERNEL,
@@ -91,7 +91,7 @@ def surface(n: int) -> Gaussians:
 
 def test_clusters_hold_the_points_of_a_cell_and_orders_are_permutations():
     scene = surface(800)
-    config = preset("full", grid=64)
+    config = refiner_preset("full", grid=64)
     structure = build_structure(scene, config)
     position = structure.cube.positions(scene.means)[structure.order] + 0.5
     cluster = torch.arange(800)
@@ -109,7 +109,7 @@ def test_clusters_hold_the_points_of_a_cell_and_orders_are_permutations():
 @pytest.mark.parametrize("n", [50, 500, 5000])
 def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
     scene = surface(n)
-    structure = build_structure(scene, preset("tiny"))
+    structure = build_structure(scene, refiner_preset("tiny"))
     position = structure.cube.positions(scene.means) + 0.5
 
     def occupied(side):

@@ -199,7 +199,7 @@ def camera_askew(
 def small_refiner(trained: bool = True, seed: int = 0, **changes):
     """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that
     residuals are not zero."""
-    from pointsplat_ns.refinement import Refiner, preset
+    from pointsplat_ns.refinement import Refiner, refiner_preset
 
     sizes = {
         "strides": (2,),
@@ -210,7 +210,7 @@ def small_refiner(trained: bool = True, seed: int = 0, **changes):
     }
     sizes |= {"dec_channels": (16,), "dec_depths": (1,), "dec_heads": (2,), "head_width": 16}
     torch.manual_seed(seed)
-    refiner = Refiner(preset("tiny", **sizes | changes)).eval()
+    refiner = Refiner(refiner_preset("tiny", **sizes | changes)).eval()
     return move_zero_layers(refiner) if trained else refiner
 
 

@@ -12,7 +12,7 @@ import pointsplat_ns as ps
 from making import box_room, move_zero_layers
 from pointsplat_ns.pipeline import repair_budget
 from pointsplat_ns.pruning.methods import METHODS
-from pointsplat_ns.refinement import Refiner, preset, save_refiner
+from pointsplat_ns.refinement import Refiner, refiner_preset, save_refiner
 from pointsplat_ns.system.threads import fixed_threads
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -88,7 +88,7 @@ def results_of(scene: Path, folder: Path) -> dict[str, Any]:
 def test_the_api_gives_the_same_bits_whatever_torchs_settings(tmp_path, monkeypatch):
     ps.save(box_room(0, count=300), tmp_path / "scene.ply")
     torch.manual_seed(0)
-    refiner = move_zero_layers(Refiner(preset("tiny", sh_degree=1)))
+    refiner = move_zero_layers(Refiner(refiner_preset("tiny", sh_degree=1)))
     save_refiner(refiner, tmp_path / "refiner.safetensors", {"keep": 0.2})
     monkeypatch.setitem(repair_budget.STEPS, "quick", 4)
     for name in ("usual", "changed"):

@@ -108,8 +108,9 @@ def evaluate_scene(
                 values[name][metric] += [] if value is None else [float(value)]
         if picture_folder is not None:
             file = f"{scene.name}_{views:04d}.png"
-            said = [f"{name} {values[name]['psnr'][-1]:.1f} dB" for name in variants]
-            picture = labelled(pictures, ["photo" if scene.has_photos else "dense render", *said])
+            labels = ["photo" if scene.has_photos else "dense render", *variants]
+            figures = ["", *(f"{values[name]['psnr'][-1]:.1f} dB" for name in variants)]
+            picture = labelled(pictures, labels, figures)
             write_picture(picture, picture_folder / file, named=False)
         views += 1
     if views == 0:
@@ -137,18 +138,20 @@ def evaluate_scene(
     )
 
 
-def labelled(pictures: Sequence[Tensor], labels: Sequence[str]) -> Tensor:
-    """Pictures (H, W, 3) in [0, 1] side by side, with a label above each: (H + L, W * count, 3) on
-    the CPU."""
+def labelled(
+    pictures: Sequence[Tensor], labels: Sequence[str], figures: Sequence[str] | None = None
+) -> Tensor:
+    """Pictures (H, W, 3) in [0, 1] side by side, with a label above each, and its figure where both
+    fit: (H + L, W * count, 3) on the CPU."""
     height, width = pictures[0].shape[:2]
     size = min(max(9, width // 24), 28)
     font = ImageFont.load_default(size)
     bar = Image.new("RGB", (width * len(pictures), size + size // 2 + 2), (24, 24, 24))
     draw = ImageDraw.Draw(bar)
     for place, label in enumerate(labels):
-        for text in (label, label.rpartition(" ")[0], label.partition(" ")[0]):
-            if draw.textlength(text, font) <= width - 4:
-                break
+        text = f"{label} {figures[place]}" if figures and figures[place] else label
+        if draw.textlength(text, font) > width - 4:
+            text = label
         draw.text((place * width + 4, size // 4), text, fill=(255, 255, 255), font=font)
     top = torch.from_numpy(np.asarray(bar, np.float32) / 255)
     return torch.cat([top, torch.cat([picture.cpu() for picture in pictures], dim=1)])

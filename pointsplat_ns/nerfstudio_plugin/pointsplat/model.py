@@ -31,7 +31,7 @@ from pointsplat_ns.pipeline.trained_refiner import (
     network_options,
 )
 from pointsplat_ns.pruning import PruneSettings
-from pointsplat_ns.refinement import Refiner, Structure, preset
+from pointsplat_ns.refinement import Refiner, Structure, refiner_preset
 from pointsplat_ns.refinement.augmentation import random_transform
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import in_unit_range
@@ -125,7 +125,7 @@ def take_network_of(init: str, config: PointSplatModelConfig) -> None:
     for name in ("size", *NETWORK_OPTIONS):
         if name in trained.options:
             setattr(config, name, trained.options[name])
-    if preset(config.size, **network_options(vars(config))) != trained.network.config:
+    if refiner_preset(config.size, **network_options(vars(config))) != trained.network.config:
         raise SceneError(
             f"--init {init}: no options of ns-train give its network; expected one that ns-train "
             "pointsplat trained"
@@ -153,7 +153,7 @@ class PointSplatModel(SplatfactoModel):
         for keep in (config.keep, *config.more_keeps):
             config.prune_settings(keep)
         manager: ScenesDataManager = self.kwargs["datamanager"]
-        self.refiner = Refiner(preset(config.size, **network_options(vars(config))))
+        self.refiner = Refiner(refiner_preset(config.size, **network_options(vars(config))))
         if config.init is not None and manager.test_mode == "val":
             trained = load_refiner(config.init, "cpu", config.by)
             self.refiner.load_state_dict(trained.network.state_dict())

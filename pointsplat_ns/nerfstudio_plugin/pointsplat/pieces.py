@@ -250,7 +250,7 @@ def cut_scenes(
         for number in range(config.cuts):
             seed = random.Random(f"{config.seed} cut {number}").getrandbits(31)
             size = max(1, round(most * (2 / 3) ** number))
-            cut = CutScene(scene, cut_scene(means, size, seed), seed, most)
+            cut = CutScene(whole=scene, cut=cut_scene(means, size, seed), seed=seed, most=most)
             found += [ScenePiece(cut, piece, config) for piece in range(cut.cut.count)]
     return found
 

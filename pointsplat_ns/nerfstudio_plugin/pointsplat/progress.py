@@ -172,7 +172,9 @@ class Progress:
         finally:
             pipeline.train(training)
         gains = [gain for _, gain in sorted(processes.gathered(found), key=lambda pair: pair[0])]
-        result = Measurement(step, pipeline.seconds, self.curves.loss, tuple(gains))
+        result = Measurement(
+            step=step, seconds=pipeline.seconds, loss=self.curves.loss, gains=tuple(gains)
+        )
         self.latest = processes.gathered([self.latest])[0]
         if self.curves.measurements:
             self.spent += self.latest

@@ -172,12 +172,12 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
         dtype=torch.float32,
     )
     return Groups(
-        group,
-        shares,
-        common.means,
-        common.cov * growth(alphas, settings)[:, None],
-        alphas.clamp_max(settings.max_opacity),
-        common.sizes.to(torch.int32),
+        group=group,
+        shares=shares,
+        means=common.means,
+        cov=common.cov * growth(alphas, settings)[:, None],
+        alphas=alphas.clamp_max(settings.max_opacity),
+        counts=common.sizes.to(torch.int32),
     )
 
 

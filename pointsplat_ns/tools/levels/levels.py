@@ -378,7 +378,10 @@ def make_levels(
             merge = StageResult("merge", scene, before)
             if repair.applies(merge):
                 context = Context(
-                    dense_on_device, views, comparison, progress=within(name, progress)
+                    dense=dense_on_device,
+                    views=views,
+                    comparison=comparison,
+                    progress=within(name, progress),
                 )
                 repaired = repair.run(merge, context)
                 scene = repaired.scene if repaired.accepted else scene
@@ -388,6 +391,23 @@ def make_levels(
         progress(f"judging {name} of {len(counts) - 1}", 0.0)
         quality = None if judge is None else judge.quality(scene)
         dropped = int((merged.assignment < 0).sum())
-        made.append(Level(scene, merged.assignment, dropped, quality, seconds, repaired))
+        made.append(
+            Level(
+                scene=scene,
+                assignment=merged.assignment,
+                dropped=dropped,
+                quality=quality,
+                seconds=seconds,
+                repair=repaired,
+            )
+        )
         start = time.perf_counter()
-    return Levels(dense, tuple(made), compared, views.origin, source, notes, judge)
+    return Levels(
+        dense=dense,
+        levels=tuple(made),
+        views=compared,
+        origin=views.origin,
+        source=source,
+        notes=notes,
+        judge=judge,
+    )

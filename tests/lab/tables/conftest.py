@@ -12,7 +12,7 @@ from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
 from making import box_room
 from pointsplat_ns.pipeline import repair_budget, view_provider
-from pointsplat_ns.refinement import Refiner, preset
+from pointsplat_ns.refinement import Refiner, refiner_preset
 from pointsplat_ns.refinement.weights import save_refiner
 from quick import quick_settings
 
@@ -24,7 +24,7 @@ def weights(tmp_path_factory) -> Callable[..., Path]:
 
     def write(name: str, metadata: dict, **changes) -> Path:
         torch.manual_seed(7)
-        network = Refiner(preset("tiny", **changes))
+        network = Refiner(refiner_preset("tiny", **changes))
         with torch.no_grad():
             [*network.heads.mlps["opacities"].modules()][-1].bias.fill_(0.5)
         path = folder / f"{name}.safetensors"

@@ -12,7 +12,7 @@ from lab.tables.networks import jobs
 from lab.tables.ways import WAYS
 from making import box_room, write_run
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.refinement import Refiner, preset
+from pointsplat_ns.refinement import Refiner, refiner_preset
 from pointsplat_ns.refinement.weights import save_refiner
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -28,7 +28,7 @@ def written(command: str, log: Path) -> None:
     model = {key.rpartition(".")[2]: value for key, value in given.items() if ".model." in key}
     switches = {name.replace("-", "_"): False for name in model if name.startswith("use-")}
     torch.manual_seed(int(given["pipeline.datamanager.seed"]))
-    network = Refiner(preset(model["size"], encoder=model["encoder"], **switches))
+    network = Refiner(refiner_preset(model["size"], encoder=model["encoder"], **switches))
     with torch.no_grad():
         [*network.heads.mlps["opacities"].modules()][-1].bias.fill_(0.3 * torch.rand(()))
     weight = {"opacity_weight": float(model["opacity-weight"])} if "opacity-weight" in model else {}

@@ -224,7 +224,7 @@ def test_other_ways_are_compared_at_the_same_count_where_asked_for(
 def test_labels_stand_over_pictures_of_any_width():
     for width in (8, 64, 1200):
         pictures = [torch.full((6, width, 3), value) for value in (0.0, 0.25, 0.5)]
-        found = labelled(pictures, ["photo", "dense 24.3 dB", "refined 18.3 dB"])
+        found = labelled(pictures, ["photo", "dense", "refined"], ["", "24.3 dB", "18.3 dB"])
         assert found.shape[1:] == (3 * width, 3)
         for place, picture in enumerate(pictures):
             assert torch.equal(found[-6:, place * width : (place + 1) * width], picture)
