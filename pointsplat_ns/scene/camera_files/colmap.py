@@ -2,7 +2,7 @@
 
 Poses are world-to-camera: a quaternion wxyz and a translation, OpenCV axes. Focal lengths,
 principal point and distortion are read from a camera's parameters. The 2D points of images are
-skipped without loading them.
+skipped without loading them; text models may lack their lines.
 
 Source: https://colmap.github.io/format.html and COLMAP's list of camera models.
 """
@@ -199,8 +199,8 @@ def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, Camera]:
 
 
 def _text_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
-    """The lines "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", each followed by a line of points,
-    which may be empty."""
+    """The lines "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME". COLMAP writes a line of points
+    after each, which may be empty; other programs leave it out."""
     for count, line in enumerate(_lines(stream, path), 1):
         need_count(path, count)
         words = line.split(maxsplit=9)
@@ -209,11 +209,34 @@ def _text_images(stream: BinaryIO, path: Path) -> Iterator[_Image]:
         except (ValueError, IndexError) as error:
             raise DataError(
                 f"{path}: {line[:60]!r} is not an image; expected a number, a quaternion wxyz, a "
-                "translation, a camera and a name, followed by a line of points"
+                "translation, a camera and a name, with or without a line of points after it"
             ) from error
         yield image
-        while (piece := stream.readline(1 << 16)) and not piece.endswith(b"\n"):
-            pass
+        _skip_points(stream)
+
+
+def _skip_points(stream: BinaryIO) -> None:
+    """Skip the next line if it is empty, or a line "POINTS2D[] as (X, Y, POINT3D_ID)", of any
+    length."""
+    start = stream.tell()
+    piece = stream.readline(_LONGEST_LINE)
+    if len(piece) < _LONGEST_LINE and not _are_points(piece.split()):
+        stream.seek(start)
+        return
+    while piece and not piece.endswith(b"\n"):  # longer than the line of an image
+        piece = stream.readline(1 << 16)
+
+
+def _are_points(words: list[bytes]) -> bool:
+    """Whether the words of a line are points: triples of two coordinates and a whole number. The
+    line of an image has ten words, or a name of several words."""
+    if len(words) % 3:
+        return False
+    try:
+        _ = [float(word) for word in words], [int(word) for word in words[2::3]]
+    except ValueError:
+        return False
+    return True
 
 
 def _lines(stream: BinaryIO, path: Path) -> Iterator[str]:

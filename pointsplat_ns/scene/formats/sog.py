@@ -129,9 +129,7 @@ def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
     index = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
     if "bands" in part:
         rest = _rest_of(meta)
-        entries = int(part["count"])
-        if not 0 < entries <= 65536:
-            raise ValueError(f"a palette of {entries} entries, expected 1 to 65536")
+        entries = _entries_of(part, index)
         colors = images.pixels(
             part["files"][0], _ACROSS * rest * -(-entries // _ACROSS), _ACROSS * rest
         )
@@ -146,6 +144,15 @@ def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
     table = _looked_up(part, colors.reshape(-1, 4), 3).reshape(-1, rest, 3)
     known = index < min(entries, len(table))
     return np.where(known[:, None, None], table[np.where(known, index, 0)], np.float32(0))
+
+
+def _entries_of(part: dict[str, Any], index: Array) -> int:
+    """Number of palette entries: ``count``, in LichtFeld's files ``palette_size``, or without
+    either, as many as the labels name. Raises ValueError if it is not a number from 1 to 65536."""
+    entries = part.get("count", part.get("palette_size", int(index.max(initial=0)) + 1))
+    if not isinstance(entries, int) or not 0 < entries <= 65536:
+        raise ValueError(f"a palette of {entries!r} entries, expected 1 to 65536")
+    return entries
 
 
 def _looked_up(part: dict[str, Any], pixels: Array, channels: int) -> Array:
