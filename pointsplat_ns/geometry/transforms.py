@@ -17,8 +17,15 @@ AXES = ("x", "y", "z", "-x", "-y", "-z")
 """Names of the directions along the world axes."""
 
 
-def direction_of(axis: str) -> Tensor:
-    """The direction (3,), float64, of a name in :data:`AXES`."""
+Direction = tuple[float, float, float]
+"""A direction by three numbers, of any length but 0."""
+
+
+def direction_of(axis: str | Direction) -> Tensor:
+    """The unit direction (3,), float64, of a name in :data:`AXES` or of three numbers."""
+    if not isinstance(axis, str):
+        numbers = torch.tensor(axis, **DOUBLES)
+        return numbers / numbers.norm()
     direction = torch.zeros(3, **DOUBLES)
     direction["xyz".index(axis[-1])] = -1.0 if axis[0] == "-" else 1.0
     return direction
@@ -30,6 +37,12 @@ def axis_along(direction: Tensor) -> str | None:
     if float(direction.abs()[axis]) <= 1 - 1e-6:
         return None
     return ("-" if float(direction[axis]) < 0 else "") + "xyz"[axis]
+
+
+def named_direction(direction: Tensor) -> str | Direction:
+    """A unit direction (3,) by the name of its axis, or by its numbers if it is along none."""
+    x, y, z = direction.tolist()
+    return axis_along(direction) or (x, y, z)
 
 
 def flip_camera_axes(camera_to_worlds: Tensor) -> Tensor:

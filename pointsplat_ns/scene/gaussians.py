@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.geometry.transforms import AXES
+from pointsplat_ns.geometry.transforms import AXES, Direction
 from pointsplat_ns.system.tensors import DOUBLES
 
 MAX_SH_DEGREE = 3
@@ -42,6 +42,16 @@ def sh_degree_of(num_rest: int) -> int:
     )
 
 
+def is_direction(up: Any) -> bool:
+    """Whether a value is three finite numbers, not all 0, whose squares fit into a float."""
+    return (
+        isinstance(up, tuple)
+        and len(up) == 3
+        and all(isinstance(part, float) for part in up)
+        and 1e-100 < math.hypot(*up) < 1e100
+    )
+
+
 Offset = tuple[float, float, float]
 """Origin of a scene in the frame of its file, scene units."""
 
@@ -50,7 +60,7 @@ class Traits(NamedTuple):
     """Properties that files declare of a scene beside its Gaussians; see :class:`Gaussians`."""
 
     antialiased: bool = False
-    up: str | None = None
+    up: str | Direction | None = None
     offset: Offset | None = None
 
 
@@ -93,14 +103,14 @@ class Gaussians:
         features_rest: (N, (d+1)^2 - 1, 3) the other coefficients of SH degree d, from 0 to 3.
         antialiased: whether the scene was trained for antialiased rendering (Mip-Splatting), and is
             drawn antialiased.
-        up: the axis that is up, "x", "y", "z", "-x", "-y" or "-z", if the scene's file declares it;
-            else None.
+        up: the axis that is up, "x", "y", "z", "-x", "-y" or "-z", or a direction along none of
+            them as three numbers, if the scene's file declares it; else None.
         offset: origin of ``means`` in the frame of the scene's file and of its poses, scene units,
             for example of a geo-referenced scene; None for (0, 0, 0).
 
     Raises:
         SceneError: if a parameter is not a tensor, its shape, device or dtype does not match the
-            others, no SH degree has this number of coefficients, ``up`` is not an axis, or
+            others, no SH degree has this number of coefficients, ``up`` is not a direction, or
             ``offset`` is not three finite numbers.
 
     Example:
@@ -131,7 +141,7 @@ class Gaussians:
     features_dc: Tensor  # [N, 3] constant SH coefficient
     features_rest: Tensor  # [N, (d+1)^2 - 1, 3] the other SH coefficients
     antialiased: bool = dataclasses.field(default=False, kw_only=True)
-    up: str | None = dataclasses.field(default=None, kw_only=True)
+    up: str | Direction | None = dataclasses.field(default=None, kw_only=True)
     offset: Offset | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -167,8 +177,11 @@ class Gaussians:
                 )
         if not self.means.dtype.is_floating_point:
             raise SceneError(f"parameters are {self.means.dtype}; expected a floating-point type")
-        if self.up is not None and self.up not in AXES:
-            raise SceneError(f"up is {self.up!r}; expected {', '.join(AXES[:-1])} or {AXES[-1]}")
+        if not (self.up is None or self.up in AXES or is_direction(self.up)):
+            raise SceneError(
+                f"up is {self.up!r}; expected {', '.join(AXES[:-1])} or {AXES[-1]}, or three "
+                "numbers"
+            )
         if self.offset is not None and not (
             len(self.offset) == 3 and all(map(math.isfinite, self.offset))
         ):

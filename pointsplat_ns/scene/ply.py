@@ -18,6 +18,8 @@ import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.scene.activated import Activated, activated_in
 from pointsplat_ns.scene.gaussians import (
     MAX_SH_DEGREE,
     PLAIN,
@@ -26,6 +28,7 @@ from pointsplat_ns.scene.gaussians import (
     Traits,
     sh_degree_of,
 )
+from pointsplat_ns.scene.moving import refuse_deformed, refuse_moving
 from pointsplat_ns.scene.offsets import SAMPLED, offset_for, offset_text
 from pointsplat_ns.scene.ply_header import Element, Header, first_lines, read_header, traits_of
 from pointsplat_ns.scene.usable import keep_usable
@@ -49,16 +52,22 @@ COLUMNS = {
 }
 """Vertex properties of each attribute; normals are ignored and written as zeros."""
 
+RGB = ["red", "green", "blue"]
+"""Vertex properties of colours that some programs write in place of SH coefficients."""
+
 
 def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties of any type in any order.
 
     The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3
-    are read. 2D Gaussians, which have no ``scale_2``, become flat ones. CloudCompare's name
-    prefixes are removed. Other properties and elements are ignored with a warning.
+    are read. 2D Gaussians, which have no ``scale_2``, become flat ones. Colours may be ``red``,
+    ``green`` and ``blue``: bytes, words, or floats from 0 to 1. Scales and opacities that are
+    stored activated are told by their values, with a message. CloudCompare's name prefixes are
+    removed. Other properties and elements are ignored with a warning.
 
     Raises:
-        SceneError: if the file is not a PLY, is truncated, or lacks a property.
+        SceneError: if the file is not a PLY, is truncated, lacks a property, or holds points or a
+            moving scene.
     """
     rows = PlyRows(path)
     require_memory(path, rows.count * 4 * (14 + 3 * rows.rest))  # float32 numbers
@@ -73,7 +82,7 @@ class PlyRows:
         warn: whether to log ignored properties and the offset of positions.
 
     Raises:
-        SceneError: if the file is not a PLY, is truncated, or lacks a property.
+        SceneError: as :func:`read_ply`.
     """
 
     path: Path
@@ -95,6 +104,8 @@ class PlyRows:
         with failure_named(path, "read"), path.open("rb") as stream:
             self._header = header = read_header(stream, path)
         self._vertex = vertex = _gaussian_element(header, path)
+        refuse_moving((name for name, _ in vertex.properties), path)
+        refuse_deformed(path)
         self.count = vertex.count
         self._in_file = _num_rest(vertex, path)
         self.rest = min(self._in_file, (MAX_SH_DEGREE + 1) ** 2 - 1)
@@ -103,16 +114,21 @@ class PlyRows:
         self._dtype = np.dtype(
             [(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties]
         )
-        self._scales = [name for name in COLUMNS["scales"] if name in (self._dtype.names or ())]
+        present = self._dtype.names or ()
+        self._scales = [name for name in COLUMNS["scales"] if name in present]
+        self._colors = COLUMNS["features_dc"] if "f_dc_0" in present else RGB
         self._start = header.size + sum(
             _least_bytes(element, header) for element in header.before("vertex")
         )
         self.traits = traits_of(header, path)
+        self._warn = warn
         self._shift: Offset | None = None
         if vertex.count and any(
             self._dtype[name].newbyteorder("=") == np.float64 for name in "xyz"
         ):
             self._shift_positions(warn)
+        if header.order:
+            _ = self._activated  # before the rows are copied and shared among processes
 
     @classmethod
     def open(cls, path: Path | str, warn: bool = True) -> PlyRows | None:
@@ -153,6 +169,7 @@ class PlyRows:
             for name, fields in columns.items()
         }
         columns["scales"] = self._scales  # for 2D Gaussians the last stays -Inf: a flat axis
+        columns["features_dc"] = self._colors
         at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
         # A double beyond float32 becomes Inf; its Gaussian is dropped like others with Inf.
         with (
@@ -170,6 +187,7 @@ class PlyRows:
                         tables[name][chunk, : len(fields)] = structured_to_unstructured(
                             values[fields], np.float32
                         )
+        self._deactivate(tables)
         tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
         tensors["features_rest"] = tensors["features_rest"].reshape(len(rows), self.rest, 3)
         antialiased, up, offset = self.traits
@@ -210,11 +228,62 @@ class PlyRows:
                 f"{self.path}: damaged PLY ({one_line(error)}); expected {wanted}"
             ) from error
 
+    def _sample(self) -> np.ndarray:
+        """About :data:`SAMPLED` rows from all over the file."""
+        with failure_named(self.path, "read"), self.path.open("rb") as stream:
+            return self._rows(stream, [*range(0, self.count, max(1, self.count // SAMPLED))])
+
+    @functools.cached_property
+    def _activated(self) -> Activated:
+        """The parameters that the file stores activated."""
+        if not self.count:
+            return Activated()
+        rows = self._sample()
+        found = activated_in(
+            _doubles(rows, COLUMNS["means"]),
+            _doubles(rows, self._scales),
+            rows["opacity"].astype(np.float64),
+            self.count,
+        )
+        if any(found) and self._warn:
+            logger.warning(
+                "%s: its %s are stored activated, as their values show, and read so",
+                self.path,
+                found,
+            )
+        return found
+
+    @functools.cached_property
+    def _color_range(self) -> float:
+        """The number that stands for full intensity in ``red``, ``green`` and ``blue``."""
+        kind = self._dtype[self._colors[0]].newbyteorder("=")
+        if kind in (np.uint8, np.uint16):
+            return float(np.iinfo(kind).max)
+        colors = _doubles(self._sample(), self._colors)
+        # some programs write bytes as floats
+        return 255.0 if bool((colors > 2).any()) else 1.0
+
+    def _deactivate(self, tables: dict[str, np.ndarray]) -> None:
+        """Convert what the file stores in another form, in place: activated scales and opacities,
+        and colours in place of SH coefficients. Negative scales become NaN."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self._activated.scales:
+                stored = tables["scales"][:, : len(self._scales)]
+                stored[:] = np.log(stored)
+            if self._activated.opacities:
+                shares = tables["opacities"].clip(0, 1)
+                tables["opacities"] = np.log(shares) - np.log1p(-shares)
+        if self._colors == RGB and len(tables["features_dc"]):
+            tables["features_dc"] = (tables["features_dc"] / self._color_range - 0.5) / SH_C0
+
     def _shift_positions(self, warn: bool) -> None:
         """Subtract an offset if float32 loses too much precision; logged if ``warn``."""
-        with failure_named(self.path, "read"), self.path.open("rb") as stream:
-            rows = self._rows(stream, [*range(0, self.count, max(1, self.count // SAMPLED))])
-        self._shift = offset_for(_doubles(rows, COLUMNS["means"]), _doubles(rows, self._scales))
+        rows = self._sample()
+        scales = _doubles(rows, self._scales)
+        if self._activated.scales:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                scales = np.log(scales)
+        self._shift = offset_for(_doubles(rows, COLUMNS["means"]), scales)
         if self._shift is not None:
             x, y, z = (
                 a + b
@@ -271,6 +340,8 @@ def _report_unread(header: Header, vertex: Element, higher: bool, path: Path) ->
     if higher:
         logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
     known = {name for names in COLUMNS.values() for name in names}
+    if not any(name == "f_dc_0" for name, _ in vertex.properties):
+        known.update(RGB)
     others = [
         name
         for name, _ in vertex.properties
@@ -312,6 +383,14 @@ def _num_rest(vertex: Element, path: Path) -> int:
             f"{path}: Mip-Splatting's 3D filter is not fused into scales (property 'filter_3D'); "
             "expected both fused, as its create_fused_ply.py writes them"
         )
+    if not present & {"opacity", "scale_0", "rot_0"}:
+        raise SceneError(
+            f"{path}: points, no Gaussians (no vertex property 'opacity', 'scale_0' or 'rot_0'); "
+            "expected a 3DGS PLY; a training of Gaussians, such as ns-train splatfacto, can start "
+            "from points"
+        )
+    if "f_dc_0" not in present and present.issuperset(RGB):
+        present.update(COLUMNS["features_dc"])
     if "scale_2" not in present and {"scale_0", "scale_1", "opacity"} <= present:
         logger.warning("%s: 2D Gaussians (no 'scale_2'), read as flat 3D ones", path)
         present.add("scale_2")

@@ -15,8 +15,8 @@ from typing import BinaryIO
 import numpy as np
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.geometry.transforms import AXES
-from pointsplat_ns.scene.gaussians import Traits
+from pointsplat_ns.geometry.transforms import AXES, Direction
+from pointsplat_ns.scene.gaussians import Traits, is_direction
 from pointsplat_ns.scene.offsets import offset_of_text, offset_text
 from pointsplat_ns.system.files import logger
 
@@ -144,7 +144,9 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
 def first_lines(traits: Traits) -> list[str]:
     """The header lines before the elements, with comments for :func:`traits_of`."""
     comments = ["SplatRenderMode: mip"] * traits.antialiased
-    comments += [] if traits.up is None else [f"Vertical Axis: {traits.up}"]
+    if traits.up is not None:
+        up = traits.up if isinstance(traits.up, str) else " ".join(map(repr, traits.up))
+        comments.append(f"Vertical Axis: {up}")
     comments += [] if traits.offset is None else [f"Offset: {offset_text(traits.offset)}"]
     return [
         "ply",
@@ -158,11 +160,13 @@ def traits_of(header: Header, path: Path) -> Traits:
     other than ordinary and antialiased are logged as a warning.
 
     Brush and splat-transform write ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot
-    ``antialiased 0`` or ``1``, nerfstudio ``Vertical Axis: z``.
+    ``antialiased 0`` or ``1``, nerfstudio ``Vertical Axis: z``, Brush ``Vertical axis: y`` or three
+    numbers.
     """
     found = False
     up = None
     offset = None
+    by_brush = "exported from brush" in (comment.lower() for comment in header.comments)
     for comment in header.comments:
         words = comment.lower().replace(":", " ").split()
         if words[:1] == ["splatrendermode"] and len(words) > 1:
@@ -173,12 +177,8 @@ def traits_of(header: Header, path: Path) -> Traits:
                 )
         elif words[:1] == ["antialiased"] and words[1:] in (["0"], ["1"]):
             found = words[1] == "1"
-        elif (
-            words[:2] == ["vertical", "axis"]
-            and len(words) == 3
-            and words[2].removeprefix("+") in AXES
-        ):
-            up = words[2].removeprefix("+")
+        elif words[:2] == ["vertical", "axis"]:
+            up = _up_of(words[2:], by_brush) or up
         elif comment.startswith("Offset: "):  # three numbers to add to x, y and z
             offset = offset_of_text(comment.removeprefix("Offset: "))
             if offset is None:
@@ -186,6 +186,25 @@ def traits_of(header: Header, path: Path) -> Traits:
                     "%s: no offset of three numbers in the comment %r", path, comment[:80]
                 )
     return Traits(found, up, offset)
+
+
+def _up_of(words: list[str], by_brush: bool) -> str | Direction | None:
+    """The up direction of a comment on the vertical axis: an axis or three numbers; None if it is
+    neither. Brush writes "y" into every file whose cameras it does not know, and means -y."""
+    if len(words) == 1 and words[0].removeprefix("+") in AXES:
+        axis = words[0].removeprefix("+")
+        return "-y" if by_brush and axis == "y" else axis
+    try:
+        numbers = tuple(
+            float(word) for word in " ".join(words).strip("[]").replace(",", " ").split()
+        )
+    except ValueError:
+        return None
+    if not is_direction(numbers):
+        return None
+    x, y, z = numbers
+    along = [axis for axis, number in zip("xyz", numbers, strict=True) if number]
+    return (x, y, z) if len(along) > 1 else ("-" if x + y + z < 0 else "") + along[0]
 
 
 def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from pointsplat_ns.geometry.harmonics import sh_matrix
 from pointsplat_ns.geometry.transforms import (
-    axis_along,
     direction_of,
+    named_direction,
     quaternions_of,
     zero_as_identity,
 )
@@ -20,8 +20,7 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 
 def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaussians:
-    """Rotate positions, Gaussians, SH and the declared up axis about the origin. An up direction
-    that is no longer an axis is dropped.
+    """Rotate positions, Gaussians, SH and the declared up direction about the origin.
 
     Args:
         scene: N Gaussians.
@@ -48,7 +47,7 @@ def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaus
         means=scene.means @ matrix.T.to(like),
         quats=(turn * Quaternion(zero_as_identity(scene.quats))).data,
         features_rest=torch.cat(rest, dim=1) if rest else scene.features_rest,
-        up=None if scene.up is None else axis_along(matrix @ direction_of(scene.up)),
+        up=None if scene.up is None else named_direction(matrix @ direction_of(scene.up)),
         offset=_times(scene.offset, matrix),
     )
 

@@ -50,7 +50,11 @@ class SceneInfo:
     up: list[float]
     """Up direction, of length 1; empty if nothing is visible."""
     up_is_guess: bool
-    """Whether the up direction is an uncertain estimate."""
+    """Whether the up direction is an uncertain estimate, or declared and contradicted by the
+    scene."""
+    up_instead: str
+    """The direction that the scene suggests in place of the declared one; empty if it contradicts
+    none."""
     fill: float | None
     """Mean number of Gaussians drawn per pixel in sampled views
     (:func:`pointsplat_ns.rendering.comparison.fill.fill`); None without views."""
@@ -72,11 +76,11 @@ class SceneInfo:
 
     @property
     def up_text(self) -> str:
-        """Name or coordinates of the up direction, and whether it is a guess; "unknown" if nothing
-        is visible."""
+        """Name or coordinates of the up direction, and whether it is uncertain; "unknown" if
+        nothing is visible."""
         if not self.up:
             return "unknown"
-        return str(Up(torch.tensor(self.up, **DOUBLES), not self.up_is_guess))
+        return str(Up(torch.tensor(self.up, **DOUBLES), not self.up_is_guess, self.up_instead))
 
     def as_dict(self) -> dict[str, Any]:
         """The figures as a dictionary for JSON."""
@@ -140,6 +144,7 @@ def info(
         offset=[] if scene.offset is None else [*scene.offset],
         up=[] if direction is None else direction.direction.tolist(),
         up_is_guess=direction is not None and not direction.sure,
+        up_instead="" if direction is None else direction.instead,
         fill=mean_fill,
         views=views_text,
         sh_energies=band_energies(scene),

@@ -46,7 +46,7 @@ from pointsplat_ns.view_sampling.content import (
 from pointsplat_ns.view_sampling.poses import level_directions, look_at, views_of
 from pointsplat_ns.view_sampling.settings import current_settings
 from pointsplat_ns.view_sampling.traces import PhotoTraces, log_widths, means_around
-from pointsplat_ns.view_sampling.upright import Surface, Up, known_up, upright
+from pointsplat_ns.view_sampling.upright import Surface, Up, checked_up, known_up, upright
 
 
 @torch.no_grad()
@@ -131,7 +131,8 @@ class Sampler:
         self.scene = thinned(scene.detach(), current_settings().sampled_count).to("cpu")
         self._step = stands_for * thinning(len(scene), current_settings().sampled_count)
         self.resolution = resolution
-        self._up = known_up(up, scene)
+        self._named_up = up
+        self._declared_up = known_up(None, scene)
 
     @cached_property
     def content(self) -> tuple[Tensor, float]:
@@ -163,10 +164,14 @@ class Sampler:
 
     @cached_property
     def up(self) -> Up:
-        """Up direction."""
+        """Up direction: named, or declared by the scene and checked against it, or estimated."""
+        if self._named_up is not None:
+            return self._named_up
         # with half as many, a published room is upside down
         few = thinned(self._in_units, 20_000)
-        return self._up or upright(few, self.surface, self._traces.sure)
+        if self._declared_up is not None:
+            return checked_up(self._declared_up, few, self.surface, self._traces.sure)
+        return upright(few, self.surface, self._traces.sure)
 
     @cached_property
     def few(self) -> Gaussians:

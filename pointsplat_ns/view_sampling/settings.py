@@ -70,6 +70,19 @@ class ViewSamplingSettings:
     and floors hide content below them. The rule is right in all of 27 captures and splats, most
     narrowly for a robot over a meadow (0.106), and wrong in a closed synthetic room (0.23)."""
 
+    min_seen_from_below: float = 0.4
+    """Minimum logarithm of the ratio of the Gaussians visible from below to those visible from
+    above, to doubt a declared up direction; infinity turns the doubt off. 18 splats and the example
+    room in their true directions have at most 0.03; 12 of them upside down have more than this.
+    In a closed synthetic room it was 0.23."""
+
+    min_other_uprightness: float = 0.3
+    """Minimum uprightness of another axis, to doubt a declared one."""
+
+    max_declared_uprightness: float = 0.5
+    """Maximum uprightness of a declared axis, as a share of the best one's, to doubt it; 0 turns
+    the doubt off. True axes have at least 0.8."""
+
     # Views (sampler.py)
 
     sampled_count: int = 250_000

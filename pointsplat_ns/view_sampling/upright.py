@@ -8,6 +8,7 @@ more is visible from there than from below.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import AXES, axis_along, direction_of, rotation_matrices
 from pointsplat_ns.rendering import pixels_of
 from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.system.files import logger
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.view_sampling.content import UNITS
 from pointsplat_ns.view_sampling.poses import around, level_directions, whole_views
@@ -35,11 +37,14 @@ class Up:
     direction: Tensor
     """(3,) float64, unit length."""
     sure: bool = True
-    """Whether it was named or declared, or clearly more of the scene is visible from above than
-    from below."""
+    """Whether it was named, or declared and not contradicted by the scene, or clearly more of the
+    scene is visible from above than from below."""
+    instead: str = ""
+    """The direction that the scene suggests in place of a declared one; empty if it contradicts
+    none."""
 
     def __str__(self) -> str:
-        """Name of the axis, or the direction.
+        """Name of the axis, or the direction, and whether it is uncertain.
 
         Example:
             >>> str(Up(torch.tensor([0.0, -1.0, 0.0]), sure=False))
@@ -48,6 +53,8 @@ class Up:
         text = axis_along(self.direction) or " ".join(
             f"{value:.2f}" for value in self.direction.tolist()
         )
+        if self.instead:
+            return f"{text} (declared, but the scene suggests {self.instead})"
         return text if self.sure else f"{text} (a guess)"
 
 
@@ -67,7 +74,7 @@ def up_named(text: str | None) -> Up | None:
 
 def known_up(named: Up | None, scene: Gaussians) -> Up | None:
     """The up direction without an estimate: named, or else declared by the scene's file."""
-    return named or up_named(scene.up)
+    return named or (None if scene.up is None else Up(direction_of(scene.up)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,18 +121,58 @@ def upright(few: Gaussians, surface: Surface, traced: bool) -> Up:
     is up, or -y, as in scenes in the frame of their first camera.
     """
     axis = upright_axis(surface, traced)
-
-    def seen_from(up: Tensor) -> int:
-        """Maximum number of Gaussians that a camera around the content shows."""
-        views = whole_views(surface.points, up, around(6), 30.0, 128, 80)
-        return max(int((pixels_of(few, view) > 0.1).sum()) for view in views)
-
-    from_above = math.log((seen_from(axis) + 1) / (seen_from(-axis) + 1))
+    from_above = _seen_from_above(few, surface, axis)
     sure = abs(from_above) >= current_settings().min_seen_from_above
     y = float(axis[1])
     z = float(axis[2])
     usual = z if abs(z) > abs(y) else -y
     return Up(axis if (from_above if sure else usual) >= 0 else -axis, sure)
+
+
+def _seen_from_above(few: Gaussians, surface: Surface, up: Tensor) -> float:
+    """Logarithm of the ratio of the Gaussians visible from above to those visible from below."""
+
+    def seen(up: Tensor) -> int:
+        """Maximum number of Gaussians that a camera around the content shows."""
+        views = whole_views(surface.points, up, around(6), 30.0, 128, 80)
+        return max(int((pixels_of(few, view) > 0.1).sum()) for view in views)
+
+    return math.log((seen(up) + 1) / (seen(-up) + 1))
+
+
+def checked_up(declared: Up, few: Gaussians, surface: Surface, traced: bool) -> Up:
+    """The declared up direction of a scene, and the one that the scene suggests instead, if it
+    contradicts: far more is visible from below than from above, or another axis has far more level
+    and vertical surfaces. The second is no evidence against a direction along no axis, such as the
+    mean of cameras, which may be many degrees off. A contradiction is logged as a warning, once for
+    each pair of directions. Arguments are those of :func:`upright`.
+    """
+    settings = current_settings()
+    up = declared.direction
+    other = None
+    if _seen_from_above(few, surface, up) < -settings.min_seen_from_below:
+        other = Up(-up)
+    elif axis_along(up) is not None:
+        found = upright(few, surface, traced)
+        rightness = _uprightness(surface, torch.stack([up, found.direction]))
+        if (
+            float(rightness[1]) > settings.min_other_uprightness
+            and float(rightness[0] / rightness[1]) < settings.max_declared_uprightness
+            and abs(float(up @ found.direction)) < math.cos(math.radians(45))
+        ):
+            other = Up(found.direction)
+    if other is None:
+        return declared
+    _warn_of_contradiction(str(declared), str(other), axis_along(other.direction) or "")
+    return Up(up, sure=False, instead=str(other))
+
+
+@functools.lru_cache(maxsize=64)
+def _warn_of_contradiction(declared: str, other: str, axis: str) -> None:
+    """Log that a scene contradicts its declared up direction; a command samples views several
+    times."""
+    hint = f"; if it is right, set it with --up={axis}" if axis else ""
+    logger.warning("the file declares %s as up, but the scene suggests %s%s", declared, other, hint)
 
 
 def upright_axis(surface: Surface, traced: bool = False) -> Tensor:
@@ -136,27 +183,6 @@ def upright_axis(surface: Surface, traced: bool = False) -> Tensor:
     where photos were taken: there all world axes get a tenth more, which aligns two of six captures
     with one.
     """
-    near = surface.points.norm(dim=1) < CONTENT_RADIUS
-    near = (near if bool(near.any()) else ~near).nonzero()[:4096, 0]
-    points = surface.points[near]
-    normals = surface.normals[near]
-    flatness = surface.flatness[near]
-    weights = flatness / flatness.sum().clamp_min(1e-300)
-
-    def uprightness(axes: Tensor) -> Tensor:
-        """Evidence (D,) for vertical axes (D, 3): the shares of level and of vertical surfaces,
-        minus their mean of 0.193 over random directions, plus the largest share of points in one
-        thin level slab."""
-        # [D, n] 90 where level
-        tilt = torch.rad2deg(torch.asin((axes @ normals.T).abs().clamp_max(1)))
-        level, vertical = ((-0.5 * (angle / 8.0).square()).exp() for angle in (90 - tilt, tilt))
-        slab = ((axes @ points.T + CONTENT_RADIUS) / 0.1).long().clamp(0, 119)
-        counts = torch.zeros(len(axes), 120, **DOUBLES)
-        counts.scatter_add_(1, slab, torch.ones_like(slab, dtype=torch.float64))
-        return (level + vertical - 0.193) @ weights + (counts[:, 1:] + counts[:, :-1]).amax(
-            1
-        ) / len(points)
-
     # directions about 7 degrees apart, on a Fibonacci spiral
     index = torch.arange(400, **DOUBLES) + 0.5
     height = 1 - index / 400
@@ -164,17 +190,36 @@ def upright_axis(surface: Surface, traced: bool = False) -> Tensor:
     turn = index * math.pi * (3 - math.sqrt(5))
     axes = torch.stack([ring * turn.cos(), ring * turn.sin(), height], dim=1)
     for degrees in (4.0, 2.0, 1.0, 0.5):
-        best = axes[uprightness(axes).topk(8).indices]
+        best = axes[_uprightness(surface, axes).topk(8).indices]
         sides = torch.cat([level_directions(axis, around(4)) for axis in best])
         axes = torch.cat(
             [best, best.repeat_interleave(4, 0) + math.tan(math.radians(degrees)) * sides]
         )
         axes = axes / axes.norm(dim=1, keepdim=True)
-    scores = uprightness(axes)
+    scores = _uprightness(surface, axes)
     world = torch.eye(3, **DOUBLES)
-    of_world = uprightness(world) * (
+    of_world = _uprightness(surface, world) * (
         1.1 if traced else world.new_tensor(current_settings().usual_axis_factors)
     )
     return (
         world[of_world.argmax()] if bool(of_world.max() >= scores.max()) else axes[scores.argmax()]
     )
+
+
+def _uprightness(surface: Surface, axes: Tensor) -> Tensor:
+    """Evidence (D,) for vertical axes (D, 3): the shares of level and of vertical surfaces, minus
+    their mean of 0.193 over random directions, plus the largest share of points in one thin level
+    slab."""
+    near = surface.points.norm(dim=1) < CONTENT_RADIUS
+    near = (near if bool(near.any()) else ~near).nonzero()[:4096, 0]
+    points = surface.points[near]
+    flatness = surface.flatness[near]
+    weights = flatness / flatness.sum().clamp_min(1e-300)
+    # [D, n] 90 where level
+    tilt = torch.rad2deg(torch.asin((axes @ surface.normals[near].T).abs().clamp_max(1)))
+    level, vertical = ((-0.5 * (angle / 8.0).square()).exp() for angle in (90 - tilt, tilt))
+    slab = ((axes @ points.T + CONTENT_RADIUS) / 0.1).long().clamp(0, 119)
+    counts = torch.zeros(len(axes), 120, **DOUBLES)
+    counts.scatter_add_(1, slab, torch.ones_like(slab, dtype=torch.float64))
+    in_slab = (counts[:, 1:] + counts[:, :-1]).amax(1) / len(points)
+    return (level + vertical - 0.193) @ weights + in_slab

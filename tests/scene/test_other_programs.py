@@ -5,17 +5,23 @@ The files in ``cases`` were made from the example room, in the form that the nam
 
 import io
 import json
+import pickle
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from plys import columns_of, write_columns
 from refusing import fails
 
 import pointsplat_ns as ps
 from making import cloud, same_bits
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.scene.camera_files import read_named_views
 from pointsplat_ns.scene.formats.sog import encode_sog
+from pointsplat_ns.scene.ply import PlyRows
+from pointsplat_ns.view_sampling.sampler import Sampler
 
 CASES = Path(__file__).parent / "cases"
 
@@ -81,3 +87,172 @@ def test_images_tell_the_size_of_a_palette_without_a_count(tmp_path, extra):
 def test_a_palette_of_no_size_is_refused(tmp_path):
     (tmp_path / "a.sog").write_bytes(without_count(encode_sog(cloud(9)), palette_size="64"))
     assert "a palette of '64' entries" in fails(lambda: ps.load(tmp_path / "a.sog"))
+
+
+def test_a_moving_scene_is_refused_by_the_name_of_its_trainer():
+    said = fails(lambda: ps.load(CASES / "stg.ply"), "moving scene of SpacetimeGaussians")
+    assert "'trbf_center'" in said and said.endswith(
+        "export a PLY of one moment from the program that trained it"
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "trainer"),
+    [
+        (["t", "scale_t_0", "rot_r_0"], "4D Gaussian Splatting"),
+        (["t", "scaling_t"], "4D Gaussian Splatting"),
+        (["xyz_disp_0", "xyz_disp_1"], "Ex4DGS"),
+        (["velocity_0", "acceleration_0", "time", "duration"], "a 4D training"),
+    ],
+)
+def test_properties_tell_moving_scenes(tmp_path, names, trainer):
+    extra = {name: np.zeros(3, np.float32) for name in names}
+    write_columns(tmp_path / "a.ply", {**columns_of(cloud(3)), **extra})
+    fails(lambda: ps.load(tmp_path / "a.ply"), f"a moving scene of {trainer}")
+    fails(lambda: PlyRows.open(tmp_path / "a.ply"), f"a moving scene of {trainer}")
+
+
+@pytest.mark.parametrize(
+    ("file", "trainer", "instead"),
+    [
+        ("deformation.pth", "4DGaussians", "export_perframe_3DGS.py"),
+        ("dynamic_point_cloud.ply", "Ex4DGS", "one moment"),
+        ("../../deform/iteration_7/deform.pth", "Deformable 3D Gaussians", "one moment"),
+    ],
+)
+def test_files_beside_a_scene_tell_that_it_moves(tmp_path, file, trainer, instead):
+    folder = tmp_path / "point_cloud" / "iteration_7"
+    scene = cloud(3)
+    for name in ("point_cloud.ply", "time_00001.ply"):
+        ps.save(scene, folder / name)
+    assert same_bits(ps.load(folder / "point_cloud.ply"), scene)
+    (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    (folder / file).write_bytes(b"")
+    fails(lambda: ps.load(folder / "point_cloud.ply"), f"moving scene of {trainer}", instead)
+    assert same_bits(ps.load(folder / "time_00001.ply"), scene)
+
+
+def activated(scene: ps.Gaussians, *names: str) -> dict[str, np.ndarray]:
+    """The vertex properties of a scene with some parameters activated."""
+    values = {"scales": scene.stds, "opacities": scene.alphas[:, None]}
+    changed = scene.replace(**{name: values[name] for name in names})
+    return columns_of(changed)
+
+
+@pytest.mark.parametrize("names", [("scales", "opacities"), ("opacities",), ("scales",)])
+@pytest.mark.parametrize("form", [{}, {"order": ">"}, {"text": True}])
+def test_activated_parameters_are_told_by_their_values(tmp_path, names, form, caplog):
+    """Scales alone are told by how dense they would make the scene, so that it has to be dense."""
+    scene = ps.example_room()[:: 4 if names == ("scales",) else 30]
+    write_columns(tmp_path / "a.ply", activated(scene, *names), **form)
+    found = ps.load(tmp_path / "a.ply")
+    assert f"its {' and '.join(names)} are stored activated" in caplog.text
+    torch.testing.assert_close(found.stds, scene.stds, rtol=1e-5, atol=0)
+    torch.testing.assert_close(found.alphas, scene.alphas, rtol=1e-5, atol=1e-6)
+    assert torch.equal(found.means, scene.means)
+
+
+def test_activated_parameters_are_read_so_in_parts(tmp_path):
+    scene = ps.example_room()[::30]
+    path = tmp_path / "a.ply"
+    write_columns(path, activated(scene, "scales", "opacities"))
+    rows = pickle.loads(pickle.dumps(PlyRows.open(path).with_sh_degree(0)))
+    assert torch.equal(rows.read(100, 200).scales, ps.load(path).scales[100:200])
+
+
+def in_millimetres() -> ps.Gaussians:
+    """A room whose log-scales are all above 0."""
+    room = ps.place(ps.example_room(), scale=1e4)
+    return room[(room.scales > 0).all(dim=1)]
+
+
+ORDINARY = {
+    "room": ps.example_room,
+    "millimetres": in_millimetres,
+    "of one opacity": lambda: in_millimetres().replace(
+        opacities=torch.full((len(in_millimetres()), 1), 0.5)
+    ),
+    "opaque": lambda: ps.example_room()[ps.example_room().opacities[:, 0] > 0],
+    "few": lambda: in_millimetres()[:20].replace(opacities=torch.linspace(0, 1, 20)[:, None]),
+    "none": lambda: ps.example_room()[:0],
+}
+"""Scenes with some of what tells activated ones."""
+
+
+@pytest.mark.parametrize("name", ORDINARY)
+def test_ordinary_scenes_are_not_taken_for_activated_ones(name, tmp_path, caplog):
+    scene = ORDINARY[name]()
+    ps.save(scene, tmp_path / "a.ply")
+    assert same_bits(ps.load(tmp_path / "a.ply"), scene) and "activated" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("full", "kind"), [(255, np.uint8), (65_535, np.uint16), (1, np.float32), (255, np.float32)]
+)
+def test_colours_without_sh_are_converted(tmp_path, full, kind, caplog):
+    scene = cloud(50, sh_degree=0)
+    columns = {name: v for name, v in columns_of(scene).items() if not name.startswith("f_dc")}
+    shares = np.random.default_rng(0).random((50, 3))
+    shares[0] = (0, 0.5, 1)
+    stored = (full * shares).round(0 if full > 1 else 7).astype(kind)
+    columns |= dict(zip(("red", "green", "blue"), stored.T, strict=True))
+    write_columns(tmp_path / "a.ply", columns)
+    found = ps.load(tmp_path / "a.ply")
+    torch.testing.assert_close(
+        0.5 + SH_C0 * found.features_dc, torch.from_numpy(stored / full).float()
+    )
+    assert torch.equal(found.opacities, scene.opacities) and not caplog.messages
+    rows = pickle.loads(pickle.dumps(PlyRows.open(tmp_path / "a.ply")))
+    assert torch.equal(rows.read(7, 9).features_dc, found.features_dc[7:9])
+
+
+def with_comments(path: Path, *comments: str) -> Path:
+    """A scene whose file has these comments."""
+    ps.save(cloud(3), path, overwrite=True)
+    lines = "".join(f"comment {comment}\n" for comment in comments).encode()
+    path.write_bytes(path.read_bytes().replace(b" 1.0\n", b" 1.0\n" + lines, 1))
+    return path
+
+
+def test_the_y_axis_that_brush_always_writes_points_down(tmp_path):
+    scene = ps.load(CASES / "brush_vertical_axis_y.ply")
+    assert scene.up == "-y"
+    ps.save(scene, tmp_path / "a.ply")
+    assert ps.load(tmp_path / "a.ply").up == "-y"
+
+
+@pytest.mark.parametrize(
+    ("comments", "up"),
+    [
+        (["Exported from Brush", "Vertical axis: y"], "-y"),
+        (["Vertical axis: y", "Exported from Brush"], "-y"),
+        (["Vertical axis: y"], "y"),
+        (["Exported from Brush", "Vertical axis: 0.123 0.456 -0.789"], (0.123, 0.456, -0.789)),
+        (["Exported from Brush", "Vertical axis: -0 -1 0"], "-y"),
+        (["Vertical axis: [0.6, 0, 0.8]"], (0.6, 0.0, 0.8)),
+        (["Vertical axis: 0 0 0"], None),
+        (["Vertical axis: nan 1 0"], None),
+        (["Vertical axis: 1e300 1 0"], None),
+        (["Vertical axis: 1 0"], None),
+    ],
+)
+def test_up_is_an_axis_or_three_numbers(comments, up, tmp_path):
+    scene = ps.load(with_comments(tmp_path / "a.ply", *comments))
+    assert scene.up == up
+    ps.save(scene, tmp_path / "b.ply")
+    assert ps.load(tmp_path / "b.ply").up == up
+
+
+def test_a_direction_along_no_axis_is_used_and_turns_with_the_scene(tmp_path):
+    scene = ps.example_room()[::100].replace(up=(0.6, 0.0, 0.8))
+    upward = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    torch.testing.assert_close(Sampler(scene).up.direction, upward)
+    placed = ps.place(scene, up="y")
+    assert placed.up == "y"
+    torch.testing.assert_close(
+        placed.means[:, 1].double(), scene.means.double() @ upward, rtol=0, atol=1e-5
+    )
+    turned = ps.place(scene, up="z:-y")
+    assert turned.up == "-y", "what is said to be up by name is so"
+    with pytest.raises(ps.SceneError, match="or three numbers"):
+        scene.replace(up=(0.0, 0.0, 0.0))

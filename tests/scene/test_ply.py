@@ -166,8 +166,13 @@ def test_2d_gaussians_are_read_as_flat_ones(tmp_path, caplog):
         ),
         (
             "vertex",
-            [*columns()[:3], ("red", "u1")],
-            ["lacks the vertex property 'f_dc_0' and 10 more"],
+            [*columns()[:3], *columns()[-8:], ("red", "u1")],
+            ["lacks the vertex property 'f_dc_0' and 2 more"],
+        ),
+        (
+            "vertex",
+            [*columns()[:3], ("red", "u1"), ("green", "u1"), ("blue", "u1")],
+            ["points, no Gaussians", "can start from points"],
         ),
         (
             "vertex",

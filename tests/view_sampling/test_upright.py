@@ -8,10 +8,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from upright_scenes import TURNS, plates, room, tower, turned
 
-from making import SHARED_DATA, ball, box_room, in_pictures
+from making import SHARED_DATA, ball, box_room, in_pictures, splats
 from pointsplat_ns.api import example_room
+from pointsplat_ns.geometry.transforms import direction_of
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.tools.scene_info import info
+from pointsplat_ns.view_sampling import upright
 from pointsplat_ns.view_sampling.content import thinned
 from pointsplat_ns.view_sampling.opening_views import opening_views
 from pointsplat_ns.view_sampling.poses import look_at, views_of
@@ -109,6 +112,44 @@ def test_up_is_the_side_from_which_more_is_seen(axis):
     if axis == (0, 1, 0):
         with use_settings(replace(DEFAULT_SETTINGS, min_seen_from_above=math.inf)):
             assert Sampler(scene).up.direction.tolist() == [0.0, -1.0, 0.0]
+
+
+def heap() -> Gaussians:
+    """Many small Gaussians on a floor of few large ones, which hides them from below."""
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(3000, 3, generator=generator) * 2 - 1
+    small = splats(
+        places * torch.tensor([1.0, 1.0, 0.2]) + torch.tensor([0.0, 0.0, 0.3]), -3.5, 4.0
+    )
+    floor = plates(((0, 0, 0), (3, 3, 0)), density=15)
+    return Gaussians.cat([small, floor.replace(scales=floor.scales + 1.0)])
+
+
+def meadow() -> Gaussians:
+    """Gaussians of all orientations in a thin level layer."""
+    generator = torch.Generator().manual_seed(0)
+    quats = torch.randn(4000, 4, generator=generator)
+    means = torch.rand(4000, 3, generator=generator) * torch.tensor([10.0, 10.0, 0.2])
+    return splats(means, torch.tensor([-2.0, -2.0, -4.0]).expand(4000, 3), 4.0).replace(quats=quats)
+
+
+@pytest.mark.parametrize(
+    ("make", "right", "wrong"), [(heap, "z", "-z"), (meadow, "z", "x"), (meadow, "z", "-y")]
+)
+def test_a_declared_axis_that_the_scene_contradicts_is_doubted_once(make, right, wrong, caplog):
+    upright._warn_of_contradiction.cache_clear()
+    up = Sampler(make().replace(up=right)).up
+    assert (str(up), up.sure, caplog.messages) == (right, True, [])
+    for _ in range(2):
+        up = Sampler(make().replace(up=wrong)).up
+        assert str(up) == f"{wrong} (declared, but the scene suggests {right})" and not up.sure
+    assert caplog.messages == [
+        f"the file declares {wrong} as up, but the scene suggests {right}; if it is right, set it "
+        f"with --up={right}"
+    ]
+    assert Sampler(make().replace(up=wrong), up=Up(direction_of(wrong))).up.sure
+    found = info(make().replace(up=wrong))
+    assert (found.up_instead, found.up_text) == (right, str(up))
 
 
 def test_a_room_is_first_seen_from_inside_and_then_from_other_sides():
