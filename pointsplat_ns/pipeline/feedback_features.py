@@ -4,13 +4,13 @@ parameters."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.pipeline.optimiser import Adam, AdamSettings, Choose
+from pointsplat_ns.refinement.feedback import FeedbackRefiner
 from pointsplat_ns.scene.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.threads import one_thread_each, parallel_for
@@ -25,9 +25,7 @@ class RepairSettings:
     damping, Adam moves all Gaussians equally far, even correct ones with tiny gradients. Half the
     rates without damping gain as much where a scene has errors, but disturb correct parts."""
     fewest_steps: int = 6
-    """Minimum number of steps in the network's training; features clamp smaller numbers to it."""
-    most_steps: int = 32
-    """Maximum number of steps in the network's training; features clamp larger numbers to it."""
+    """Features clamp smaller numbers of steps to this one."""
     nearly_right: float = 35.0
     """PSNR over the pixels that the dense scene covers, dB, above which learning rates fall with
     the root mean square error; see :func:`~pointsplat_ns.pipeline.repair.initial_rate_factor`. Full
@@ -78,7 +76,7 @@ class Feedback(Adam):
 
     @torch.no_grad()
     def factors(
-        self, network: Callable[[Tensor], Tensor], scene: Gaussians, done: float, steps: int
+        self, network: FeedbackRefiner, scene: Gaussians, done: float, steps: int
     ) -> Tensor:
         """Step factors (K, 6) that a network computes from :meth:`features`, which documents the
         other arguments. The network runs on pieces that fit a core's cache, one thread per piece,
@@ -86,7 +84,8 @@ class Feedback(Adam):
         factors = scene.means.new_empty(len(scene), len(PARAMETERS))
 
         def fill(rows: slice) -> None:
-            factors[rows] = network(self.features(scene, done, steps, rows)).to(factors)
+            features = self.features(scene, done, min(steps, network.most_steps), rows)
+            factors[rows] = network(features).to(factors)
 
         with one_thread_each():
             parallel_for(fill, pieces(len(scene), scene.device, 1 << 12), scene.device)
@@ -150,7 +149,7 @@ class Feedback(Adam):
             colours.clamp(-4, 4) / 2,
             self._visibility[rows] / self._weight_sum(1),
         ]
-        log_steps = math.log10(min(max(steps, REPAIR.fewest_steps), REPAIR.most_steps))
+        log_steps = math.log10(max(steps, REPAIR.fewest_steps))
         common = scene.means.new_tensor([done, log_steps, self._log_keep]).expand(len(scales), 3)
         return torch.cat([*columns, common], dim=1).float().clamp_(-8, 8).nan_to_num_(0.0)
 

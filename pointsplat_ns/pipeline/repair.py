@@ -95,7 +95,7 @@ def repair(
             if budget.seconds is None:
                 expected = budget.steps
             else:
-                expected = round(run.count / run.done) if run.done else REPAIR.most_steps
+                expected = round(run.count / run.done) if run.done else network.most_steps
             factors = feedback.factors(network, scene, run.done, expected)
         return first_factor * cosine_factor(run.done, REPAIR.last_factor), factors
 

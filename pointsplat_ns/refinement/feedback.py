@@ -20,15 +20,23 @@ import torch
 from torch import Tensor, nn
 
 from pointsplat_ns.refinement.network import linear, zero_linear
-from pointsplat_ns.refinement.weights import checked_tensors, opened_weights
+from pointsplat_ns.refinement.weights import WeightsError, checked_tensors, opened_weights
 from pointsplat_ns.scene.gaussians import PARAMETERS
 from pointsplat_ns.system.files import write_tensors
 
 FEEDBACK_FORMAT = "pointsplat-feedback/2"
 
+MOST_STEPS = 100_000
+"""Maximum number of steps that a file may say its training had."""
+
 
 class FeedbackRefiner(nn.Module):
     """An MLP on the features of each Gaussian.
+
+    Args:
+        most_steps: maximum number of steps of the repairs in its training; longer ones enter the
+            network as so many.
+        inputs: number of inputs; more than :attr:`FEATURES` for experiments.
 
     Example:
         >>> FeedbackRefiner()(torch.zeros(5, FeedbackRefiner.FEATURES)).unique().tolist()
@@ -41,11 +49,12 @@ class FeedbackRefiner(nn.Module):
     MAX_LOG_FACTOR = 2.0
     """Bound of the factors' logarithms: factors are from 1/7 to 7."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_steps: int = 32, inputs: int = FEATURES) -> None:
         super().__init__()
+        self.most_steps = most_steps
         with torch.device("cpu"):
             self.mlp = nn.Sequential(
-                linear(self.FEATURES, 64),
+                linear(inputs, 64),
                 nn.SiLU(),
                 linear(64, 64),
                 nn.SiLU(),
@@ -64,11 +73,12 @@ def save_feedback_refiner(
 ) -> None:
     """Write a network, with metadata, which may be anything that JSON can hold: data, command,
     steps, results."""
-    write_tensors(
-        path,
-        network.state_dict(),
-        {"format": FEEDBACK_FORMAT, "metadata": json.dumps(metadata or {})},
-    )
+    header = {
+        "format": FEEDBACK_FORMAT,
+        "most_steps": str(network.most_steps),
+        "metadata": json.dumps(metadata or {}),
+    }
+    write_tensors(path, network.state_dict(), header)
 
 
 @lru_cache(maxsize=2)
@@ -84,7 +94,13 @@ def read_feedback_refiner(path: Path | str) -> FeedbackRefiner:
     """Read a network, in evaluation mode. Raises WeightsError if the file is none."""
     path = Path(path)
     network = FeedbackRefiner()
-    with opened_weights(path, FEEDBACK_FORMAT, "a feedback refiner") as (file, _):
+    with opened_weights(path, FEEDBACK_FORMAT, "a feedback refiner") as (file, header):
+        steps = header.get("most_steps", "32")
+        if not (steps.isdecimal() and 1 <= int(steps[:9]) <= MOST_STEPS):
+            raise WeightsError(
+                f"{path}: most_steps is {steps[:20]!r}; expected a number from 1 to {MOST_STEPS}"
+            )
+        network.most_steps = int(steps)
         state = checked_tensors(file, network.state_dict(), path)
     network.load_state_dict(state)
     return network.eval().requires_grad_(requires_grad=False)
