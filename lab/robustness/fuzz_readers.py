@@ -22,6 +22,7 @@ import torch
 from PIL import Image
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.scene.formats.glb_tile import encode_tile
 from pointsplat_ns.scene.formats.sog import encode_sog
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene
@@ -88,6 +89,11 @@ def _sog_folder(folder: Path) -> None:
         archive.extractall(folder)
 
 
+def _tile(folder: Path) -> None:
+    """The content of a tile."""
+    (folder / "0.glb").write_bytes(encode_tile(some_scene()))
+
+
 def _gzipped(data: bytes) -> bytes:
     return gzip.compress(data, 1, mtime=0)
 
@@ -101,6 +107,9 @@ READERS |= {
     "sog": at("a.sog", _scene),  # as they are: zip archives
     "sog-meta": at("meta.json", _in_folder, _sog_folder),
     "sog-image": at("quats.webp", _in_folder, _sog_folder),
+    "gltf": at("a.gltf", _scene),  # .glb too, which content tells
+    "tileset": at("tileset.json", _in_folder, _tile),
+    "rad": at("a.rad", _scene),
     "zip": at("a.zip", _scene),  # as they are
     "checkpoint": at(
         "a.ckpt", _scene

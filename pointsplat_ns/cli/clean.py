@@ -22,7 +22,7 @@ def clean(
     """Remove floaters, and Gaussians that cannot be drawn or are never visible.
 
     Args:
-        output: file to write (.ply, .spz, .sog or .splat); by default beside the scene, in its
+        output: file to write, in any format of convert; by default beside the scene, in its
             format: room_clean.ply for room.ply.
         strength: strength of the removal of floaters, in [0, 1]. Floaters are Gaussians far in
             front of the visible surfaces that hardly change pictures. 0 removes only Gaussians that

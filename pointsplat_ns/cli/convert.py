@@ -27,9 +27,11 @@ def convert(
     """Write a scene in another format. docs/formats.md describes the losses of formats.
 
     Args:
-        scene: file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat),
-            Splatfacto checkpoint, or run (its folder or config.yml).
-        output: file to write; its suffix sets the format: .ply, .spz, .sog or .splat.
+        scene: file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat, .glb,
+            .gltf, .rad, tileset.json or its folder), Splatfacto checkpoint, or run (its folder or
+            config.yml).
+        output: file to write; its suffix sets the format: .ply, .spz, .sog, .splat, .glb, .gltf
+            or .spz.glb (a .glb with SPZ inside).
         sh: SH bands to keep: all, or a maximum degree.
         up: new up axis: x, y, z, -x, -y or -z; by default nothing is rotated. The old up direction
             is declared by the file, or estimated; -y:z gives it as -y. Write --up=-y for a negative

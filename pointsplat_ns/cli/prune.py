@@ -37,7 +37,7 @@ def prune(
     Renders, if needed, use views from --poses, else from the run's dataset, else sampled views.
 
     Args:
-        output: file to write; its suffix sets the format: .ply, .spz, .sog or .splat. By default
+        output: file to write; its suffix sets the format, as for convert. By default
             beside the scene, in its format: room_pruned.ply for room.ply, pruned.ply in the folder
             of a run.
         memory: memory limit, such as 8GB; by default the free memory. A PLY that needs more is

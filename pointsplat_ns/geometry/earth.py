@@ -105,6 +105,24 @@ class Place:
         return matrix
 
 
+def local_frame(point: Tensor) -> Tensor | None:
+    """The matrix (4, 4) float64 from axes east, north and up at a point (3,) to the Earth-centred
+    frame, metres. None if the point is not within 100 km of the ellipsoid."""
+    squeeze = (1 - _FLATTENING) ** 2
+    # The normal of the ellipsoid below a point at a height of 1 km is 1e-6 from this one.
+    up = point / torch.tensor([1.0, 1.0, squeeze], **DOUBLES)
+    if not 0 < float(up.norm()) < 1e8:
+        return None
+    up = up / up.norm()
+    latitude = math.asin(float(up[2].clamp(-1, 1)))
+    longitude = math.atan2(float(point[1]), float(point[0]))
+    if float((_earth_centred(latitude, longitude, 0.0) - point).norm()) > 1e5:
+        return None
+    return Place(None, (math.degrees(latitude), math.degrees(longitude), 0.0)).frame(
+        torch.zeros(3, **DOUBLES), torch.eye(3, **DOUBLES)
+    )
+
+
 def _upwards(latitude: float, longitude: float) -> Tensor:
     """The normal (3,) of the ellipsoid; angles in radians."""
     level = math.cos(latitude)

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.scene.formats import READABLE, format_named, format_to_read
+from pointsplat_ns.scene.formats import READABLE, TILESET, format_named, format_to_read
+from pointsplat_ns.scene.formats.gltf import has_gaussians, read_gltf
 from pointsplat_ns.scene.inert_yaml import read_config
 from pointsplat_ns.scene.ply import read_ply
 from pointsplat_ns.scene.ply_header import read_header
@@ -190,13 +191,13 @@ def shown_scene(names: list[str], eval_scenes: Iterable[str]) -> str:
 def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Path]:
     """Scene files at or below a path whose names are ``wanted``, sorted.
 
-    Folders of runs, hidden folders and results of commands are not searched. The headers of PLY
-    files are read, because a PLY may hold points or a mesh. Pipes, sockets and devices are not
-    opened, because they may never end.
+    Folders of runs and of 3D Tiles, hidden folders and results of commands are not searched. The
+    headers of PLY and glTF files are read, because they may hold points or a mesh. Pipes, sockets
+    and devices are not opened, because they may never end.
     """
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
-        results = {FOLDER_FILES.scenes, FOLDER_FILES.levels}.intersection(files)
+        results = {FOLDER_FILES.scenes, FOLDER_FILES.levels, TILESET}.intersection(files)
         if RUN_FILES.config in files or (results and Path(place) != root):
             inner.clear()
             continue
@@ -235,12 +236,14 @@ def _when(run: Run) -> tuple[float, int]:
 
 
 def _why_none(path: Path) -> str:
-    """Why a file holds no Gaussians: it is a PLY of points or of a mesh. Empty if it holds some, or
-    if its reader reports the reason."""
+    """Why a file holds no Gaussians: it is a PLY or glTF of points or of a mesh. Empty if it holds
+    some, or if its reader reports the reason."""
     if not path.is_file():
         return "not a regular file"
     try:
         kind = format_to_read(path)
+        if kind is not None and kind.read is read_gltf:
+            return "" if has_gaussians(path) else "no Gaussians in it"
         if kind is None or kind.read is not read_ply:
             return ""
     except SceneError:

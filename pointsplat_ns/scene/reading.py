@@ -63,8 +63,10 @@ def read_scene(path: Path | str, all_rows: bool = False) -> Gaussians:
     Args:
         path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or its
             ``meta.json``), a streamed SOG (``lod-meta.json`` or its folder; the finest level is
-            read), ``.splat``, a checkpoint of Splatfacto (``.ckpt``) or gsplat (``.pt``),
-            ``config.yml`` or a run's folder. The photos of a run are not needed.
+            read), ``.splat``, ``.glb`` or ``.gltf`` with Gaussians, 3D Tiles of them
+            (``tileset.json`` or its folder) or a ``.rad`` (of both, the finest level), a checkpoint
+            of Splatfacto (``.ckpt``) or gsplat (``.pt``), ``config.yml`` or a run's folder. The
+            photos of a run are not needed.
         all_rows: whether to include Gaussians that cannot be drawn.
 
     Returns:
@@ -138,7 +140,8 @@ def save(
     """Write a scene in the format of the path's suffix.
 
     ``.ply`` is the 3DGS PLY: a float32 scene is read back exact to the bit. ``.spz`` (version 3),
-    ``.sog`` and ``.splat`` have fewer bits. Gaussians that cannot be drawn (NaN, or Inf where it is
+    ``.sog``, ``.splat`` and ``.spz.glb`` have fewer bits; ``.glb`` and ``.gltf`` have floats as
+    drawn, see :mod:`~pointsplat_ns.scene.formats.gltf`. Gaussians that cannot be drawn (NaN, or Inf where it is
     not valid) are dropped, and their number is logged. The write is atomic.
 
     Args:
@@ -185,6 +188,12 @@ def save_as(
     assert kind.write is not None
     scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
     warn_of_losses(kind, scene, name or path)
+    if kind.up and scene.up is None:
+        logger.warning(
+            "%s: %s is %s up, and the scene declares no up axis; if it looks turned, `pointsplat "
+            "convert SCENE %s --up %s` turns it",
+            *(name or path, kind.name, kind.up, Path(name or path).name, kind.up),
+        )
     kind.write(scene, path, progress)
 
 
@@ -205,7 +214,7 @@ class SourceFile(NamedTuple):
     """The file that a dense scene was read from."""
 
     name: str
-    """For a SOG folder, streamed or not, that folder."""
+    """For a folder of SOG, streamed or not, or of 3D Tiles, that folder."""
     bytes: int
     """Total of all files of a folder."""
     sha256: str
@@ -225,14 +234,15 @@ def source_file(path: Path | str) -> SourceFile:
         lines = (
             f"{part.relative_to(folder).as_posix()} {digest}\n" for part, digest in hashes.items()
         )
-        name = folder.resolve().name
+        name = name if is_scene_file(path) else folder.resolve().name
         digest = hashlib.sha256("".join(lines).encode()).hexdigest()
     return SourceFile(name, size, digest)
 
 
 def source_parts(path: Path | str) -> list[Path]:
-    """The files of a scene: all of a SOG folder, by name, streamed or not; the checkpoint of a run;
-    or one file. Raises SceneError if a run has no checkpoint, or a folder cannot be read."""
+    """The files of a scene: all of a SOG folder, by name, streamed or not; of 3D Tiles, a ``.gltf``
+    or ``.rad``, the file and those that it names; the checkpoint of a run; or one file. Raises
+    SceneError if a run has no checkpoint, or a folder cannot be read."""
     path = Path(path)
     folder = path.parent if path.name in (SOG_META, STREAM_META) else path
     streamed = path.name != SOG_META and (folder / STREAM_META).is_file()
@@ -246,6 +256,9 @@ def source_parts(path: Path | str) -> list[Path]:
             return sorted(
                 filter(Path.is_file, stream_parts(folder / STREAM_META) if streamed else images)
             )
-    if may_be_run(path) and not (path.is_file() and format_to_read(path)):
+    kind = None if (folder / RUN_FILES.config).is_file() else format_to_read(path)
+    if kind is not None and kind.parts is not None:
+        return kind.parts(path / kind.suffix if path.is_dir() else path)
+    if kind is None and may_be_run(path):
         return [open_run(path, need_data=False).checkpoint]
     return [path]

@@ -1,10 +1,12 @@
 """A value of another type at any key of any JSON file that is read: a result, or one typed error
 in one line."""
 
+import base64
 import copy
 import io
 import json
 import logging
+import struct
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +19,8 @@ from lab.robustness.fuzz_readers import READERS, Read, at, some_scene
 from lab.robustness.fuzzing import judge
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig, _split
+from pointsplat_ns.scene.formats.gltf import encode_gltf
+from pointsplat_ns.scene.formats.rad import encode_rad
 from pointsplat_ns.scene.formats.sog import encode_sog
 from pointsplat_ns.scene.formats.sog_stream import (
     STREAM_META,
@@ -26,6 +30,7 @@ from pointsplat_ns.scene.formats.sog_stream import (
     stream_parts,
     write_sog_stream,
 )
+from pointsplat_ns.scene.reading import read_scene
 
 OTHERS = (
     None,
@@ -132,10 +137,83 @@ def photos_of_scannetpp(folder: Path) -> None:
 
 Made = Callable[[Path], tuple[Read, Any]]
 
+TILES = {
+    "asset": {"version": "1.1", "gltfUpAxis": "Y", "extras": {"pointsplat_ns": {"up": "z"}}},
+    "root": {
+        "refine": "REPLACE",
+        "transform": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1],
+        "content": {"uri": "missing.glb"},
+        "children": [
+            {"content": {"uri": "0.glb"}, "refine": "ADD", "children": [{}]},
+            {"contents": [{"url": "0.glb"}]},
+        ],
+    },
+}
+
+
+def gltf(folder: Path) -> tuple[Read, Any]:
+    """A glTF whose buffer is a file beside it."""
+    content = json.loads(encode_gltf(some_scene().replace(up="z", offset=(1.0, 2.0, 3.0))))
+    buffer = content["buffers"][0]
+    data = base64.b64decode(buffer["uri"].partition(",")[2])
+    (folder / "a.bin").write_bytes(data + bytes(4))
+    buffer.update(uri="a.bin", byteLength=len(data) + 4)
+    content["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": 4})
+    accessor = content["accessors"][3]
+    accessor["sparse"] = {
+        "count": 1,
+        "indices": {
+            "bufferView": len(content["bufferViews"]) - 1,
+            "componentType": 5121,
+            "byteOffset": 3,
+        },
+        "values": {"bufferView": accessor["bufferView"], "byteOffset": 0},
+    }
+    content["bufferViews"][1]["byteStride"] = 4
+    del content["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
+    (name,) = content["extensionsUsed"]
+    content["meshes"].append({"primitives": [{"attributes": {}, "extensions": {}}]})
+    content["nodes"].append({"mesh": 1, "translation": [1, 2, 3], "rotation": [0, 0, 0, 1]})
+    content["nodes"].append({"children": [0, 1], "scale": [2, 2, 2]})
+    content["scenes"] = [{"nodes": [2]}]
+    assert (
+        "extras" in content["nodes"][0]
+        and name in content["meshes"][0]["primitives"][0]["extensions"]
+    )
+    return READERS["gltf"](folder), content
+
+
+def rad(magic: str) -> Made:
+    """A RAD file of one page, whose description at the start of the file or page is changed."""
+    data = encode_rad(some_scene(), torch.zeros(6), torch.zeros(6))
+    at_page = data.index(b"RADC")
+    start = data.index(magic.encode())
+    (length,) = struct.unpack_from("<I", data, start + 4)
+    end = start + 8 + -(-length // 8) * 8
+
+    def described(text: bytes, tag: bytes) -> bytes:
+        return tag + struct.pack("<I", len(text)) + text + bytes(-len(text) % 8)
+
+    def inside(text: bytes) -> bytes:
+        if magic == "RAD0":
+            return described(text, b"RAD0") + data[end:]
+        page = described(text, b"RADC") + data[end:]
+        head = json.loads(data[8:at_page].rstrip(b"\0"))
+        head["chunks"] = [{"offset": 0, "bytes": len(page)}]
+        return described(json.dumps(head).encode(), b"RAD0") + page
+
+    right = json.loads(data[start + 8 : start + 8 + length])
+    return lambda folder: (at("a.rad", read_scene, inside=inside)(folder), right)
+
+
 FILES: dict[str, Made] = {
     "sog-meta": lambda folder: (READERS["sog-meta"](folder), meta_of_sog()),
     "sog-meta of version 1": lambda folder: (READERS["sog-meta"](folder), meta_of_first_sog()),
     "sog-stream": lambda folder: (at(STREAM_META, of_stream)(folder), stream(folder)),
+    "gltf": gltf,
+    "tileset": lambda folder: (READERS["tileset"](folder), TILES),
+    "rad": rad("RAD0"),
+    "page of a rad": rad("RADC"),
     "transforms.json": lambda folder: (READERS["camera-json"](folder), NERFSTUDIO),
     "cameras.json": lambda folder: (READERS["camera-json"](folder), INRIA),
     "frame of a run": lambda folder: (

@@ -10,6 +10,7 @@ import zipfile
 import zlib
 
 import pytest
+import torch
 import zstandard
 from compressed_plys import encode_compressed_ply
 from foreign import encode_spz4
@@ -17,6 +18,8 @@ from refusing import fails
 
 import pointsplat_ns as ps
 from making import cloud
+from pointsplat_ns.scene.formats.gltf import encode_glb, encode_gltf, encode_spz_glb
+from pointsplat_ns.scene.formats.rad import encode_rad
 from pointsplat_ns.scene.formats.sog import encode_sog
 from pointsplat_ns.scene.formats.splat import encode_splat
 from pointsplat_ns.scene.formats.spz import encode_spz
@@ -26,6 +29,10 @@ FILES = {
     ".spz": encode_spz(cloud(300, 5, 1)),
     "4.spz": encode_spz4(cloud(300, 5, 1)),
     ".sog": encode_sog(cloud(300, 5, 1)),
+    ".glb": encode_glb(cloud(300, 5, 1)),
+    ".gltf": encode_gltf(cloud(300, 5, 1)).rstrip(),
+    ".spz.glb": encode_spz_glb(cloud(300, 5, 1)),
+    ".rad": encode_rad(cloud(300, 5, 1), torch.zeros(300), torch.zeros(300)),
     ".splat": encode_splat(cloud(300, 5, 0)),
 }
 

@@ -19,6 +19,8 @@ from lab.robustness.fuzz_readers import zip_of
 from making import SHARED_DATA, cloud, normal_scene, same_bits, write_run
 from pointsplat_ns.scene.discovery import find_scenes
 from pointsplat_ns.scene.formats import format_like, format_named, format_to_read
+from pointsplat_ns.scene.formats.gltf import encode_glb, encode_spz_glb
+from pointsplat_ns.scene.formats.rad import encode_rad
 from pointsplat_ns.scene.formats.sog import encode_sog
 from pointsplat_ns.scene.formats.spz import encode_spz
 from pointsplat_ns.scene.reading import kind_of, source_file
@@ -51,6 +53,9 @@ def contents(tmp_path_factory):
         "SPZ 3": (encode_spz(SCENE), ".spz"),
         "SPZ 4": (encode_spz4(SCENE), ".spz"),
         "SOG": (encode_sog(SCENE), ".sog"),
+        "glTF": (encode_glb(SCENE), ".glb"),
+        "glTF with SPZ": (encode_spz_glb(SCENE), ".spz.glb"),
+        "RAD": (encode_rad(SCENE, torch.zeros(64), torch.zeros(64)), ".rad"),
         "checkpoint": (torch_bytes(checkpoint()), ".ckpt"),
         "checkpoint of old torch": (
             torch_bytes(checkpoint(), _use_new_zipfile_serialization=False),
@@ -84,6 +89,9 @@ def test_a_renamed_file_is_written_again_as_what_it_is(tmp_path, contents):
         ("compressed PLY", ".sog"),
         ("SPZ 3", ".spz"),
         ("SOG", ".sog"),
+        ("glTF", ".glb"),
+        ("glTF with SPZ", ".spz.glb"),
+        ("RAD", ".ply"),
     ):
         path = tmp_path / "x.splat"
         path.write_bytes(contents[kind][0])
@@ -131,7 +139,8 @@ REFUSED = {
     "z.zip": (zip_of({"a.ply": "ply\n" * 99})[:-30], "a truncated or damaged zip archive"),
     "z.splat": (b"# a text of words and numbers 32\n" * 32, "text"),
     "z.spz": (gzip.compress(b"ply\nformat ascii 1.0\n"), "SPZ of b'ply\\n'"),
-    "x.glb": (b"glTF" + bytes(60), "glTF files are not read; export the scene"),
+    "x.glb": (b"glTF" + bytes(60), "glTF of version 0; expected 2"),
+    "x.radc": (b"RADC" + bytes(60), "page of a RAD files are not read; name its .rad"),
 }
 
 
@@ -158,7 +167,7 @@ def test_info_names_runs_and_checkpoints_in_them_with_method_and_step(tmp_path, 
 SPLATS = SHARED_DATA / "splats"
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".splat"])
+@pytest.mark.parametrize("suffix", [".ply", ".splat", ".glb", ".gltf"])
 def test_the_size_of_a_file_is_known_to_the_byte(tmp_path, suffix):
     bytes_of = format_named(suffix).bytes_of
     for n, degree in ((0, 0), (1, 3), (255, 1), (256, 2), (257, 0), (1001, 3)):

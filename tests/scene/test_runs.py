@@ -104,7 +104,7 @@ def test_other_methods_are_passed_over_and_said_where_nothing_is_left(make_run, 
 
 
 def test_anything_else_is_refused_with_what_is_accepted(tmp_path):
-    accepted = ".splat), a checkpoint of Splatfacto or gsplat (.ckpt, .pt)"
+    accepted = "tileset.json), a checkpoint of Splatfacto or gsplat (.ckpt, .pt)"
     (tmp_path / "scene.obj").write_bytes(b"")
     fails(
         lambda: read_scene(tmp_path / "scene.obj"), tmp_path / "scene.obj", "a .obj file", accepted
@@ -114,5 +114,9 @@ def test_anything_else_is_refused_with_what_is_accepted(tmp_path):
     fails(
         lambda: save(normal_scene(), tmp_path / "a.obj"), "cannot write a .obj file", ".spz, .sog"
     )
-    fails(lambda: save(normal_scene(), tmp_path / "a.rad"), "cannot write a RAD file")
+    fails(
+        lambda: save(normal_scene(), tmp_path / "a.rad"),
+        "cannot write a RAD file here",
+        "lod SCENE -o",
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.obj"]

@@ -17,14 +17,19 @@ from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.checkpoints import read_checkpoint
-from pointsplat_ns.scene.formats import sog, splat, spz
+from pointsplat_ns.scene.formats import gltf, sog, splat, spz
 from pointsplat_ns.scene.formats.capacity import Capacity
 from pointsplat_ns.scene.formats.compressed_ply import is_compressed, read_compressed_ply
+from pointsplat_ns.scene.formats.gltf import encode_glb, encode_gltf, encode_spz_glb, read_gltf
+from pointsplat_ns.scene.formats.rad import MAGIC as RAD_MAGIC
+from pointsplat_ns.scene.formats.rad import PAGE_MAGIC as RAD_PAGE
+from pointsplat_ns.scene.formats.rad import rad_parts, read_rad
 from pointsplat_ns.scene.formats.sog import encode_sog, read_sog, rounded_for_sog
 from pointsplat_ns.scene.formats.sog_images import SOG_META
 from pointsplat_ns.scene.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.scene.formats.splat import encode_splat, read_splat
 from pointsplat_ns.scene.formats.spz import encode_spz, read_spz, rounded_for_spz
+from pointsplat_ns.scene.formats.tileset import TILESET, read_tileset, tileset_parts
 from pointsplat_ns.scene.gaussians import Gaussians, Traits
 from pointsplat_ns.scene.ply import ply_bytes, read_ply, write_ply
 from pointsplat_ns.scene.ply_header import read_header
@@ -55,8 +60,14 @@ class Format:
     """Encodes a scene, where only the encoded bytes give the file size."""
     rounded: Callable[[Gaussians, float], Gaussians] | None = None
     """Rounds a scene's numbers to make its file smaller, by a tolerance (see :mod:`rounding`)."""
+    parts: Callable[[Path], list[Path]] | None = None
+    """All files of a scene, the named one first, if it may have others beside it."""
     capacity: Capacity = Capacity()
     """Range and step of each attribute in its files."""
+    written_by: str = ""
+    """The command that writes its files, if it is another one than those that write a scene."""
+    up: str = ""
+    """The up axis of all its files, if the format has one."""
 
 
 def _writer(
@@ -127,7 +138,13 @@ FORMATS = (
         starts=(b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P",),
         zip_member="data.pkl",
     ),
-    Format("streamed SOG", STREAM_META, read_sog_stream, capacity=sog.CAPACITY),
+    Format(
+        "streamed SOG",
+        STREAM_META,
+        read_sog_stream,
+        capacity=sog.CAPACITY,
+        written_by="pointsplat lod SCENE --stream",
+    ),
     Format("SOG folder", SOG_META, read_sog),
     Format(
         "splat",
@@ -137,14 +154,60 @@ FORMATS = (
         bytes_of=lambda count, *_: 32 * count,
         capacity=splat.CAPACITY,
     ),
+    Format(
+        "glTF with SPZ",
+        ".spz.glb",
+        read_gltf,
+        _writer(encode_spz_glb),
+        encode=encode_spz_glb,
+        rounded=rounded_for_spz,
+        capacity=gltf.CAPACITY_SPZ,
+        up="y",
+    ),
+    Format(
+        "glTF",
+        ".glb",
+        read_gltf,
+        _writer(encode_glb),
+        starts=(b"glTF",),
+        bytes_of=gltf.glb_bytes,
+        capacity=gltf.CAPACITY,
+        up="y",
+    ),
+    Format(
+        "glTF",
+        ".gltf",
+        read_gltf,
+        _writer(encode_gltf),
+        bytes_of=gltf.gltf_bytes,
+        parts=gltf.gltf_parts,
+        capacity=gltf.CAPACITY,
+        up="y",
+    ),
     Format("zip of a PLY", "", zip_member="*.ply", instead="unpack it and name the PLY"),
     Format("ksplat", ".ksplat", instead=_CONVERT),
     Format("LCC", ".lcc", instead=_CONVERT),
     Format("LCC", ".lcc2", instead=_CONVERT),
     Format("Postshot project", ".psht", instead=_EXPORT),
-    Format("RAD", ".rad", instead=_EXPORT, capacity=Capacity(antialiased=False)),
+    Format(
+        "RAD",
+        ".rad",
+        read_rad,
+        starts=(RAD_MAGIC,),
+        parts=rad_parts,
+        capacity=Capacity(antialiased=False, offset=True),
+        written_by="pointsplat lod SCENE -o room.rad",
+    ),
+    Format("page of a RAD", ".radc", starts=(RAD_PAGE,), instead="name its .rad"),
+    Format(
+        "3D Tiles",
+        TILESET,
+        read_tileset,
+        parts=tileset_parts,
+        capacity=gltf.CAPACITY_SPZ,
+        written_by="pointsplat lod SCENE --tiles",
+    ),
     Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), zip_member="*.usd[ac]", instead=_EXPORT),
-    Format("glTF", ".glb", starts=(b"glTF",), instead=_EXPORT),
     Format(
         "LAS point cloud", ".las", starts=(b"LASF",), instead="it contains points, no Gaussians"
     ),
@@ -180,12 +243,16 @@ def format_named(name: str) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """The format of a file or SOG folder, streamed or not: by content, or else by name. None if
-    both are unknown. Raises SceneError if the file cannot be read, or its format is known but not
-    supported."""
+    """The format of a file, or of a folder of SOG, streamed or not, or of 3D Tiles: by content, or
+    else by name. None if both are unknown. Raises SceneError if the file cannot be read, or its
+    format is known but not supported."""
     if path.is_dir():
         return next(
-            (format_named(name) for name in (STREAM_META, SOG_META) if (path / name).is_file()),
+            (
+                format_named(name)
+                for name in (STREAM_META, SOG_META, TILESET)
+                if (path / name).is_file()
+            ),
             None,
         )
     with failure_named(path, "read"):
@@ -202,6 +269,8 @@ def _told_by_content(path: Path, start: bytes) -> Format | None:
     if start.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return _told_by_zip(path)
     kind = next((kind for kind in FORMATS if start.startswith(kind.starts)), None)
+    if kind is not None and kind.read is read_gltf:
+        return format_named(".spz.glb") if gltf.has_spz(path) else kind
     if kind is not None and kind.starts == _PLY:
         compressed, plain = FORMATS[:2]
         with suppress(SceneError), path.open("rb") as stream:
@@ -243,6 +312,8 @@ def format_to_write(path: Path | str) -> Format:
     kind = format_named(path.name)
     if kind is None or kind.write is None:
         what = f"a {kind.name} file" if kind else f"a {path.suffix or 'nameless'} file"
+        if kind is not None and kind.written_by:
+            raise SceneError(f"{path}: cannot write {what} here; use `{kind.written_by}`")
         raise SceneError(f"{path}: cannot write {what}; expected a name that ends in {WRITABLE}")
     return kind
 

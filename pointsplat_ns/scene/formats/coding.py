@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,18 @@ def load_bytes(path: Path) -> bytes:
     """The whole content of a file; a SceneError if it does not fit into memory."""
     require_memory(path, path.stat().st_size)
     return path.read_bytes()
+
+
+def file_beside(path: Path, name: Any) -> Path:
+    """The file that ``path`` names relative to its folder. Raises SceneError unless it is there or
+    in a folder below."""
+    place = PurePosixPath(name) if isinstance(name, str) else PurePosixPath()
+    bad = ".." in place.parts or place.is_absolute() or set("\\:\0") & set(str(name))
+    if bad or not place.parts:
+        raise SceneError(
+            f"{path}: names the file {str(name)[:80]!r}; expected one in its own folder"
+        )
+    return path.parent.joinpath(*place.parts)
 
 
 def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: int) -> None:
@@ -142,6 +154,13 @@ def logits_of_bytes(levels: Array) -> Array:
     """Finite opacity logits of bytes. Bytes 0 and 255 are decoded as 0.25 and 254.75, the middle of
     the values rounded to them, because some programs drop infinite logits."""
     share = np.clip(levels.astype(np.float64), 0.25, 254.75) / 255
+    return np.log(share / (1 - share)).astype(np.float32)
+
+
+def logits_of_shares(alphas: Array) -> Array:
+    """Finite opacity logits of opacities from 0 to 1, float64. Opacities that float32 rounds to 1
+    are decoded as the middle of the values rounded to it."""
+    share = np.clip(alphas, 1e-13, 1 - 2.0**-25)
     return np.log(share / (1 - share)).astype(np.float32)
 
 

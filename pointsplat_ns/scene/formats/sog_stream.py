@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.transforms import rotation_matrices
-from pointsplat_ns.scene.formats.coding import damage_named, joined
+from pointsplat_ns.scene.formats.coding import damage_named, file_beside, joined
 from pointsplat_ns.scene.formats.sog import read_sog, sog_parts
 from pointsplat_ns.scene.formats.sog_images import SOG_META
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -242,12 +242,10 @@ def _meta(path: Path) -> dict[str, Any]:
 
 def _beside(path: Path, name: Any) -> Path:
     """A SOG file named in ``lod-meta.json``, which must be in or below its folder."""
-    parts = PurePosixPath(name).parts if isinstance(name, str) else ()
-    if not parts or ".." in parts or PurePosixPath(name).is_absolute() or set("\\:") & set(name):
-        raise SceneError(f"{path}: names the file {name!r}; expected one in its own folder")
-    if parts[-1] != SOG_META and not name.lower().endswith(".sog"):
+    file = file_beside(path, name)
+    if file.name != SOG_META and not name.lower().endswith(".sog"):
         raise SceneError(f"{path}: names the file {name!r}; expected a {SOG_META} or a .sog")
-    return path.parent.joinpath(*parts)
+    return file
 
 
 def _counts(tree: Any, level: int, names: list[str]) -> Counter[int]:

@@ -17,6 +17,8 @@ from pointsplat_ns.geometry.transforms import smallest_turn
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.formats.capacity import typical_sizes
 from pointsplat_ns.scene.formats.glb_tile import TILE_EXTENSIONS, encode_tile
+from pointsplat_ns.scene.formats.gltf_nodes import EXTRAS
+from pointsplat_ns.scene.formats.tileset import TILESET
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.offsets import from_centre
 from pointsplat_ns.scene.reading import warn_of_losses
@@ -26,9 +28,6 @@ from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.tools.levels.tree import Cell, cells
 from pointsplat_ns.view_sampling.sampler import Sampler
 from pointsplat_ns.view_sampling.upright import known_up, up_named
-
-TILESET = "tileset.json"
-"""Name of the index file."""
 
 
 def placed(
@@ -124,7 +123,11 @@ def write_tiles(
             name: list(TILE_EXTENSIONS) for name in ("extensionsUsed", "extensionsRequired")
         }
         tileset = {
-            "asset": {"version": "1.1", "generator": "pointsplat-ns"},
+            "asset": {
+                "version": "1.1",
+                "generator": "pointsplat-ns",
+                "extras": {EXTRAS: {"up": levels[0].up}},
+            },
             "extensionsUsed": ["3DTILES_content_gltf"],
             "extensions": {"3DTILES_content_gltf": extensions},
             "geometricError": root["geometricError"],
