@@ -141,8 +141,8 @@ def save(
 
     ``.ply`` is the 3DGS PLY: a float32 scene is read back exact to the bit. ``.spz`` (version 3),
     ``.sog``, ``.splat`` and ``.spz.glb`` have fewer bits; ``.glb`` and ``.gltf`` have floats as
-    drawn, see :mod:`~pointsplat_ns.scene.formats.gltf`. Gaussians that cannot be drawn (NaN, or Inf where it is
-    not valid) are dropped, and their number is logged. The write is atomic.
+    drawn, see :mod:`~pointsplat_ns.scene.formats.gltf`. Gaussians that cannot be drawn (NaN, or Inf
+    where it is not valid) are dropped, and their number is logged. The write is atomic.
 
     Args:
         scene: N Gaussians of SH degree d, on any device and of any floating dtype. In a PLY each

@@ -22,9 +22,9 @@ def load(path: str | Path, scene: str | None = None, data: str | Path | None = N
 
     Args:
         path: a scene file (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder,
-            ``.splat``, ``.glb``, ``.gltf``, ``.rad``, 3D Tiles), a checkpoint of Splatfacto or gsplat, a Splatfacto run (its folder or
-            ``config.yml``), or a ``pointsplat`` run, whose dense scene is pruned and refined as in
-            its training.
+            ``.splat``, ``.glb``, ``.gltf``, ``.rad``, 3D Tiles), a checkpoint of Splatfacto or
+            gsplat, a Splatfacto run (its folder or ``config.yml``), or a ``pointsplat`` run, whose
+            dense scene is pruned and refined as in its training.
         scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else
             the first.
         data: folder of the scenes of a ``pointsplat`` run, if they have moved.
