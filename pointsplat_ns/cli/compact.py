@@ -323,15 +323,15 @@ def _file_text(path: Path) -> str:
 def _print_use(
     goal: GoalName | None, page: Path | None, scene: Path, quality: Quality | None
 ) -> None:
-    """Print the use of a page; for a headset also the fill, which limits its speed."""
+    """Print the use of a page; for a headset also what lowers the fill, which limits its
+    speed."""
     from pointsplat_ns.scene.runs import name_of
 
     if page is not None:
         use = GOALS[goal].use.format(url=quote(page.name), name=escape(name_of(scene)))
         say(f"{page}: {written_size(page)}, {use}")
     if goal == "headset" and quality is not None:
-        fill = f"{quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
-        say(f"fill: {fill}; if close-up views are too slow, use a smaller --keep")
+        say("if close-up views are too slow, use a smaller --keep, which lowers the fill")
 
 
 def _print_next(scene: Path, output: Path, quality: Quality | None) -> None:

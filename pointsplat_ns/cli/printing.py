@@ -69,9 +69,9 @@ def print_result(
     in_parts: bool = False,
 ) -> None:
     """Print stages (the method, and ``also`` refined, repaired), counts, file size, duration, and
-    the quality against the dense scene, or the reason why it is unknown. A scene merged
+    quality against the dense scene and fill, or the reason why they are unknown. A scene merged
     ``in_parts`` does not fit into memory."""
-    from pointsplat_ns.tools.wording import quality_text
+    from pointsplat_ns.tools.wording import fill_text, quality_text
 
     *first, last = [{"merge": "merged", "clean": "cleaned"}.get(by, f"pruned by {by}"), *also]
     done = f"{', '.join(first)} and {last}" if first else last
@@ -84,6 +84,7 @@ def print_result(
     say(f"{where}: {summary}, {written_size(where)}, in {seconds_text(seconds)}")
     if quality is not None:
         say(quality_text(quality))
+        say(fill_text(quality))
     elif in_parts:
         say("not compared with the dense scene: it does not fit into memory")
     else:

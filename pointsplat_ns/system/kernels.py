@@ -162,10 +162,7 @@ class Kernels:
         elif not self._path.is_file():
             others = any(self._path.parent.glob("kernels.*.so"))
             found = "built from other sources" if others else "not built"
-            why = (
-                f"{found}; installing builds them if there is a C++ compiler (in a clone: pip "
-                "install -e .)"
-            )
+            why = f"{found}; {self._how_to_build}"
         else:
             try:
                 ctypes.CDLL(str(self._path))
@@ -177,6 +174,17 @@ class Kernels:
             why,
         )
         return why
+
+    @property
+    def _how_to_build(self) -> str:
+        """What to run. A clone in the current folder hides an installed package and its kernels."""
+        clone = self._path.parents[2] if len(self._path.parents) > 2 else self._path.parent
+        if (clone / "setup.py").is_file():
+            return (
+                f"with a C++ compiler, in {clone}: python setup.py build_ext --inplace (this clone "
+                "is used, not an installed package)"
+            )
+        return "installing builds them if there is a C++ compiler (in a clone: pip install -e .)"
 
     def usable(self, wanted: bool | None) -> bool:
         """Whether to use the kernels. False never does; True warns if they are missing."""

@@ -98,11 +98,12 @@ def quality_lines(quality: Quality) -> tuple[str, ...]:
 def quality_details(quality: Quality) -> str:
     """A line with further figures of a result."""
     views = f"{views_text(quality.views)} of {quality.width} x {quality.height} pixels"
-    fills = f"{quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
-    return (
-        f"in {views} ({origin_text(quality.origin)}), {decibels(quality.worst)} in the worst; "
-        f"fill: {fills}"
-    )
+    return f"in {views} ({origin_text(quality.origin)}), {decibels(quality.worst)} in the worst"
+
+
+def fill_text(quality: Quality) -> str:
+    """Fill (overdraw) of the dense scene and of a result; it limits the speed of viewers."""
+    return f"fill: {quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
 
 
 def quality_json(quality: Quality | None) -> dict[str, Any]:

@@ -102,6 +102,8 @@ def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(tmp_path, c
     assert "nothing is merged, all 300 Gaussians remain" in said
     assert "\nmore than 60 dB, SSIM 1.00: looks the same\n" in said or suffix != ".ply"
     assert re.search(r"(?m)^(more than )?[\d.]+ dB, SSIM \d.\d\d: ", said) and "inf" not in said
+    fill = re.search(r"(?m)^fill: ([\d.]+) -> ([\d.]+) Gaussians drawn per pixel$", said)
+    assert fill is not None and float(fill[2]) == pytest.approx(float(fill[1]), rel=0.1)
 
 
 def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypatch):

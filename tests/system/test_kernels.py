@@ -219,6 +219,11 @@ def test_a_library_that_is_missing_old_or_damaged_is_not_loaded(tmp_path):
     assert Kernels(library).why_missing == f"not built; {how}"
     (tmp_path / "kernels.0123456789abcdee.so").touch()
     assert Kernels(library).why_missing == f"built from other sources; {how}"
+    clone = tmp_path / "clone" / "pointsplat_ns" / "system" / library.name
+    clone.parent.mkdir(parents=True)
+    (tmp_path / "clone" / "setup.py").touch()
+    why = Kernels(clone).why_missing
+    assert why.startswith("not built") and f"{tmp_path / 'clone'}: python setup.py build_ext" in why
     library.write_bytes(b"no library")
     assert Kernels(library).why_missing.startswith(f"{library}: ")
 
