@@ -11,10 +11,13 @@ import torch
 from PIL import Image
 from refusing import fails
 
+from making import SHARED_DATA
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig, fuse_depth
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
 from replica_scenes import CAMERA, line_of, write_scene
+
+ROOM0 = SHARED_DATA / "replica_room0" / "room0"
 
 
 @pytest.fixture()
@@ -237,3 +240,34 @@ def test_sequences_of_semantic_nerf_are_read_as_the_same_scene(row, tmp_path):
         load_replica(sequence.parent)
     (sequence / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
     assert load_replica(sequence).params.fx == CAMERA["fx"]
+
+
+@pytest.mark.skipif(not ROOM0.is_dir(), reason="needs twenty frames of Replica's room0")
+def test_frames_of_replica_itself_are_read_and_agree_with_each_other():
+    """The depths of one frame, moved into the pose of another, are the other's depths: the scale,
+    the poses, the axes and the pixel centres are read as Replica means them."""
+    scene = load_replica(ROOM0)
+    params = scene.params
+    assert (len(scene), params.width, params.height, params.scale) == (20, 1200, 680, 6553.5)
+    assert [len(parse(ROOM0, split).image_filenames) for split in ("train", "val")] == [18, 2]
+    cx, cy = params.principal_point
+    first, last = (read_depth(scene.depths[index], params) for index in (0, 19))
+    # pixel centres at half pixels, as the principal point has them
+    x, y = np.meshgrid(np.arange(params.width) + 0.5, np.arange(params.height) + 0.5)
+    rays = np.stack([(x - cx) / params.fx, (y - cy) / params.fy, np.ones_like(x)], axis=-1)
+    to_last = np.linalg.inv(scene.poses[19]) @ scene.poses[0]
+    assert np.linalg.norm(to_last[:3, 3]) > 0.01  # m: the camera has moved
+    moved = (rays * first[..., None]).reshape(-1, 3) @ to_last[:3, :3].T + to_last[:3, 3]
+    column = np.floor(params.fx * moved[:, 0] / moved[:, 2] + cx).astype(int)
+    line = np.floor(params.fy * moved[:, 1] / moved[:, 2] + cy).astype(int)
+    inside = (column >= 0) & (column < params.width) & (line >= 0) & (line < params.height)
+    assert inside.mean() > 0.7
+    there = last[line[inside], column[inside]]
+    error = np.abs(moved[inside, 2] - there)
+    assert np.median(error) < 0.005, f"{np.median(error)} m"  # half a pixel on slanted walls
+    photos = [read_photo(scene.photos[index], params) for index in (0, 19)]
+    seen = np.abs(
+        photos[0].reshape(-1, 3)[inside].astype(float)
+        - photos[1][line[inside], column[inside]].astype(float)
+    )
+    assert np.median(seen) < 8  # of 255: the same places have the same colours
