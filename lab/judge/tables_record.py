@@ -1,71 +1,89 @@
-"""Writes docs/record/results.md and its figure from what ``python -m lab.tables`` measured.
+"""Writes docs/record/results.md, its figures and the times in docs/tables.md from what ``python -m
+lab.tables`` measured.
 
     python -m lab.judge.tables_record docs/record/results.json
 
-The table of encoders is of ``encoders.json`` beside the page, which refiners.py measured. ``prune``
-and ``compact`` are left out: judge.py measures them, in views that no decision used.
+The table of encoders is of ``encoders.json`` beside the page, which refiners.py measured, and the
+row of Replica of ``replica.json``, which replica_row.py wrote.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import textwrap
 from pathlib import Path
+from statistics import fmean
 
 import tyro
 
-from lab.common.printing import markdown, start
+from lab.common.printing import markdown, number, put_between, start
 from lab.judge import refiners
-from lab.judge.record import FOLDER
+from lab.judge.record import FOLDER, ROOT
+from lab.tables import sources
 from lab.tables.cells import Tables
+from lab.tables.curves import TUNED, last_gain, mean_curve, plot_curves
 from lab.tables.figure import plot_figure
-from lab.tables.layout import Layout, Table, markdown_table
-from lab.tables.ways import WAYS
+from lab.tables.findings import CLAIMS, OURS, paragraph
+from lab.tables.layout import Layout, Table, escaped, markdown_table
+from lab.tables.replica_row import section
+from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.system.files import replacing
 
-SHOWN = (1, 3, 4)
-"""Numbers of the tables that are shown: times need an idle machine, and Figure 4 shows its
-medians."""
+MAIN = "captures"
+"""The group of scenes that the finding and the figures are of."""
 
-LEFT_OUT = (
-    "SSIM",
-    "PSNR (renders)",
-    "SSIM (renders)",
-    "LPIPS (renders)",
-    "spread",
-    "loses most",
-    "scenes",
-)
+LEFT_OUT = ("PSNR (renders)", "SSIM (renders)", "spread", "loses most", "scenes")
 """Columns that the page leaves to the measured rows."""
 
 FIGURE = "results_figure4.png"
 
-PAGE = """# The paper's networks and scores on four captures
+CURVES = "results_curves.png"
 
-`lab/judge/tables_record.py` writes this page from [results.json](results.json).
-[`python -m lab.tables`](../tables.md) measured it on four [captures](../benchmarks.md#scenes) that no network and no
-constant saw:
+ENCODERS_FILE = "encoders.json"
+
+REPLICA_FILE = "replica.json"
+
+TIMES = "times"
+"""Name of the marks around the table of times."""
+
+PAGE = """# The paper's tables on {count} captures
+
+{finding}
+
+{ours}
+
+A difference is a mean over the captures ± its standard deviation over them, at 10 % of the Gaussians: of PSNR in
+held-out photos, or in percent how much less is drawn or waited for. A claim holds, or does not, if the mean is beyond
+that spread.
+
+## How it was measured
+
+`lab/judge/tables_record.py` writes this page from [results.json](results.json), which
+[`python -m lab.tables`](../tables.md) measured on [captures](../benchmarks.md#scenes) that no constant was chosen on.
+In a clone, with its kernels built (`python setup.py build_ext --inplace`), this makes a dense scene and measures one
+row of each table; other rows are named in the same way:
 
 ```bash
-python -m lab.tables.networks captures -o networks --seeds 3 --steps 120
-python -m lab.tables outputs/room35 outputs/phone outputs/can outputs/office -o results --views 5 --side 320 \\
-    --scoring-views 12 --fine-tune 60 --refiners networks --groups captures=room35,phone,can,office
+python -m lab.judge.captures room35 clone captures/room35
+ns-train splatfacto-cpu --output-dir outputs --experiment-name room35 --max-num-iterations 2000 --data captures/room35 \\
+    nerfstudio-data --eval-mode interval --eval-interval 8
+{commands}
 ```
 
-- Cells are PSNR (dB)/LPIPS (AlexNet) against held-out photos: means over the captures.
-- Scenes and sizes are not the paper's:
-  {sizes}.
-- "made with": steps of fine-tuning, or encoder, size and steps of a network. Each network learned at the share of its
-  column, on the six captures that tune, against dense renders, by the loss rmse + 0.05 LPIPS, at twelve times the
-  usual rates; those of Table 4 three times (± standard deviation).
-- The published trainings take 10,000 steps. After so few as here, rows II to V of Table 4 are above I and differ by no
-  more than their spread: it does not support that gating and position help. Nor do 690 steps, on three captures:
-  I 19.27, II 18.75 ± 0.22, III 18.91 ± 0.15, IV 18.81 ± 0.14, V 18.57 ± 0.22.
-- \\*: nothing is fine-tuned or refined. "-" was not measured.
+{scenes}
+
+- Protocols of rows with a network: *unseen*, the network saw other scenes only; *own photos*, it was trained on the
+  training photos of these captures, and other photos are held out. The program refuses any other weights.
+- PSNR is in dB. LPIPS is by AlexNet, LPIPS VGG by VGG. "-" was not measured.
+- \\*: nothing is fine-tuned or refined.
+- "made with": steps of fine-tuning, or encoder, size, steps, share and loss of the network.
+- ms a frame: on this CPU, by compiled kernels, and by torch alone; `python -m lab.speed.cuda` times a GPU, which none of
+  these rows was drawn on. Fill: Gaussians that a viewer draws on a pixel.
 - Measured on {machines}.
 """
 
-ENCODERS = """**Dual-branch against concatenating encoder, three seeds each**
+ENCODERS = """## Dual-branch against concatenating encoder, three seeds each
 
 `lab/judge/refiners.py` measured [encoders.json](encoders.json): the gain over the paper's selection in three unseen
 scenes (apt_kitchen_balcony, pc_playbot, rock), 960 pixels wide, and its standard deviation over seeds. Networks learned
@@ -82,83 +100,175 @@ ns-train pointsplat --data scenes --pipeline.datamanager.supervision dense --pip
 """
 
 
+SETTINGS = """## Cited or unknown
+
+The released code is [anhthuan1999/pointsplat](https://github.com/anhthuan1999/pointsplat), as of commit 6d093b9.
+
+{table}
+
+Hours of the published training on a GPU are unknown: no step of it was measured there. On one thread of a CPU a step on
+two views of 320 pixels and 5,757 Gaussians takes 0.30 s for the size `tiny` and 0.67 s for `small`, so 10,000 steps take
+about 0.8 and 1.9 hours; the published network has the size `full`. `python -m lab.speed.training RUN --refiner` measures
+steps.
+"""
+
+
 def read(path: Path) -> Tables:
-    """The tables of a file that lab.tables wrote, without the cells of ``prune`` and
-    ``compact``."""
-    tables = Tables.of(json.loads(path.read_text("utf-8")))
-    left_out = {WAYS.merge.name, WAYS.compact.name}
-    tables.cells = {key: cell for key, cell in tables.cells.items() if cell["way"] not in left_out}
+    """The tables of a file that lab.tables wrote."""
+    content = json.loads(path.read_text("utf-8"))
+    tables = Tables.of(content)
+    tables.missing = dict(content.get("not_measured", {}))
     return tables
 
 
 def shortened(table: Table) -> Table:
-    """A table without rows that were not measured, notes and :data:`LEFT_OUT`, with PSNR and LPIPS
-    in one cell: Table 4 with the parts of each model and the spread; the others with a method's
-    shares or lambdas side by side, and Table 1 with what each was made with, but for its share and
-    loss."""
+    """A table without rows that were not measured, which a note names; without columns that have no
+    figures, and :data:`LEFT_OUT`."""
     rows = [
         dict(zip(table.header, row, strict=True)) for row in table.rows if "not measured" not in row
     ]
-    parts = [name for name in table.header if name not in (*LEFT_OUT, "PSNR", "LPIPS", "made with")]
-    if table.number == 4:
-        header = ["model", "parts", "PSNR/LPIPS"]
-        lines = []
-        for row in rows:
-            spread = "" if row["spread"] == "-" else f" ± {row['spread']}"
-            used = ", ".join(name for name in parts[1:] if row[name])
-            lines.append([row["model"], used, f"{row['PSNR']}{spread}/{row['LPIPS']}"])
-        return dataclasses.replace(
-            table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[]
-        )
-    found = {tuple(row[name] for name in parts): row for row in rows}
-    columns, methods = (list(dict.fromkeys(words[place] for words in found)) for place in (0, 1))
-    header = [parts[1], *columns]
-    lines = []
-    for method in methods:
-        own = {column: found[column, method] for column in columns if (column, method) in found}
-        lines.append(
-            [method, *(f"{own[c]['PSNR']}/{own[c]['LPIPS']}" if c in own else "-" for c in columns)]
-        )
-        if table.number == 1:  # networks of Table 3 are made like these
-            lines[-1].append(
-                "; ".join(
-                    dict.fromkeys(row["made with"].partition(", keep")[0] for row in own.values())
-                )
-            )
-    header += ["made with"] * (table.number == 1)
-    return dataclasses.replace(
-        table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[]
+    header = [
+        name
+        for name in table.header
+        if name not in LEFT_OUT and any(row[name] not in ("", "-") for row in rows)
+    ]
+    if table.number == 4 and any(row["spread"] != "-" for row in rows):
+        header.insert(header.index("PSNR") + 1, "spread")
+    lines = [tuple(row[name] for name in header) for row in rows]
+    missing = [
+        " ".join(word for word in row[: row.index("not measured")] if word not in ("", "yes"))
+        for row in table.rows
+        if "not measured" in row
+    ]
+    notes = [f"Not measured: {', '.join(missing)}"] if missing else []
+    return dataclasses.replace(table, header=tuple(header), rows=lines, notes=notes)
+
+
+def commands(tables: Tables, names: list[str]) -> str:
+    """Commands that measure one row of each table again, from those of its cells."""
+    one_each = ((WAYS.lightgaussian, 0.1), (WAYS.merge, 0.1), (WAYS.paper, 0.1))
+    found = []
+    for way, share in one_each:
+        keys = (cell_key(name, way, share) for name in sorted(names, key=lambda n: n != "room35"))
+        cell = next((tables.cells[key] for key in keys if key in tables.cells), None)
+        if cell is not None:
+            words = textwrap.wrap(cell["point"]["command"], 114, break_on_hyphens=False)
+            found.append(" \\\n    ".join(words))
+    return "\n".join(found)
+
+
+def not_measured(tables: Tables) -> str:
+    """The commands that fill the rows of networks that were not measured."""
+    reasons = [why for why in tables.missing.values() if "--refiners" in why]
+    return (
+        "\nRows without weights are filled by these networks, on other scenes and on these:\n\n"
+        "```bash\n"
+        "python -m lab.tables.networks other_outputs -o networks\n"
+        "python -m lab.tables.networks outputs -o own_networks --own\n"
+        "python -m lab.tables outputs -o tables --refiners networks own_networks\n"
+        "```\n"
+        if reasons
+        else ""
     )
 
 
-def page(tables: Tables, encoders: Path) -> str:
-    """The page of all tables, that of encoders from the rows of a file of refiners.py."""
-    abouts = list(tables.scenes.values())
+def curves(tables: Tables, names: list[str]) -> str:
+    """The figure of curves, and what their last halves gain; empty without curves."""
+    gains = []
+    for way in TUNED:
+        curve = mean_curve(tables.cells, names, way, PROTOCOL.ablation_share)
+        if curve:
+            steps = f"{curve[-2][0]:,} to {curve[-1][0]:,}"
+            gains.append(f"{way.label} {last_gain(curve):+.2f} dB from step {steps}")
+    if not gains:
+        return ""
+    return (
+        f"![PSNR over steps of fine-tuning]({CURVES})\n\n*PSNR over the steps of fine-tuning, means "
+        f"over the captures. At 10 %, the last half of the steps still gains: {'; '.join(gains)}.*"
+    )
+
+
+def times(tables: Tables) -> str:
+    """The table of seconds that the cells of each way took, at the smallest share: made, and
+    judged; means over scenes."""
+    found: dict[str, list[tuple[float, float | None]]] = {}
+    for way, share in WAYS.cells(PROTOCOL.shares):
+        if share not in (1.0, PROTOCOL.ablation_share):
+            continue
+        for name in tables.scenes:
+            cell = tables.cells.get(cell_key(name, way, share))
+            if cell is not None:
+                point = cell["point"]
+                found.setdefault(_name(way), []).append((point["seconds"], point.get("judged")))
+    seconds = number(1)
+    lines = []
+    for label, both in found.items():
+        judged = [value for _, value in both if value is not None]
+        made = seconds(fmean(value for value, _ in both))
+        lines.append([label, made, seconds(fmean(judged)) if judged else "-"])
+    return markdown(["row, 10 %", "s to make", "s to judge"], lines)
+
+
+def _wrapped(text: str) -> str:
+    """A paragraph in lines of at most 120 characters."""
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
+
+
+def _name(way: Way) -> str:
+    weight = "" if way.opacity_weight is None else f", lambda {way.opacity_weight:g}"
+    return escaped(f"{way.label}{weight}")
+
+
+def page(tables: Tables, record: Path) -> str:
+    """The page of all tables, that of encoders and the row of Replica from files in a folder."""
+    groups = tables.groups()
+    main_names = groups.get(MAIN, next(iter(groups.values())))
+    abouts = [tables.scenes[name] for names in groups.values() for name in names]
+    heads = ["scene", "judged in", "size", "differs from the paper in"]
+    scenes = [
+        [
+            about["name"],
+            f"{about['views']} {about['origin']}",
+            f"{about['width']} x {about['height']}",
+            about["differs"],
+        ]
+        for about in abouts
+    ]
     text = PAGE.format(
-        sizes=", ".join(
-            f"{about['width']} x {about['height']} ({about['name']})" for about in abouts
+        count=len(main_names),
+        finding=_wrapped(f"**Finding.** {escaped(paragraph(CLAIMS, tables.cells, main_names))}"),
+        ours=_wrapped(
+            "**Merging and compact**, of this package. "
+            f"{escaped(paragraph(OURS, tables.cells, main_names))}"
         ),
+        commands=commands(tables, main_names),
+        scenes=markdown(heads, [list(map(escaped, line)) for line in scenes]),
         machines="\n  and ".join(sorted({about["machine"] for about in abouts})),
     )
-    layouts = [Layout(tables, group, names, ()) for group, names in tables.groups().items()]
-    tables_shown = [table for each in layouts for table in each.tables() if table.number in SHOWN]
-    shown = [
-        markdown_table(table)
-        for table in map(shortened, tables_shown)
-        if len(table.rows) > (table.number == 4)
-    ]
+    shown = []
+    for group, names in groups.items():
+        short = map(shortened, Layout(tables, group, names, ()).tables())
+        shown += [f"## Tables: {escaped(group)}"]
+        shown += [markdown_table(table) for table in short if len(table.rows) > 1]
     figure = (
         f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*"
     )
-    compared = markdown(
-        refiners.HEADS, refiners.lines(json.loads(encoders.read_text("utf-8"))["rows"])
+    encoders = json.loads((record / ENCODERS_FILE).read_text("utf-8"))["rows"]
+    compared = markdown(refiners.HEADS, refiners.lines(encoders))
+    replica = record / REPLICA_FILE
+    of_replica = section(json.loads(replica.read_text("utf-8"))) if replica.is_file() else ""
+    cited = SETTINGS.format(table=markdown(["setting", "value", "source"], sources.lines()))
+    parts = (
+        text,
+        *shown,
+        not_measured(tables),
+        curves(tables, main_names),
+        figure,
+        of_replica,
+        ENCODERS.format(table=compared),
+        cited,
     )
-    return (
-        "\n\n".join(
-            part.strip() for part in (text, *shown, figure, ENCODERS.format(table=compared))
-        )
-        + "\n"
-    )
+    return "\n\n".join(part.strip() for part in parts if part.strip()) + "\n"
 
 
 def main(file: tyro.conf.Positional[Path], record: Path = FOLDER) -> None:
@@ -166,12 +276,18 @@ def main(file: tyro.conf.Positional[Path], record: Path = FOLDER) -> None:
 
     Args:
         file: tables.json of ``python -m lab.tables``.
-        record: folder for results.md and its figure.
+        record: folder for results.md and its figures.
     """
     tables = read(file)
+    groups = tables.groups()
     with replacing(record / "results.md") as part:
-        part.write_text(page(tables, record / "encoders.json"), "utf-8")
-    plot_figure(tables.cells, tables.groups(), record / FIGURE)
+        part.write_text(page(tables, record), "utf-8")
+    plot_figure(tables.cells, groups, record / FIGURE)
+    plot_curves(tables.cells, groups.get(MAIN, next(iter(groups.values()))), record / CURVES)
+    guide = ROOT / "docs" / "tables.md"
+    text = put_between(guide.read_text("utf-8"), times(tables), guide, TIMES)
+    with replacing(guide) as part:
+        part.write_text(text, "utf-8")
     print(record / "results.md")
 
 

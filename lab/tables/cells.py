@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from lab.common.results import Row, write_json
-from lab.tables.ways import PROTOCOL, published
+from lab.tables.ways import PROTOCOL, PUBLISHED_METRICS, published
 from pointsplat_ns.errors import SceneError
 
 FILES = ("tables.json", "tables.md", "figure4.png")
 """Files in a folder of tables; the first has all cells."""
 
 FORMAT = {"format": "pointsplat-tables", "version": 1}
-
-METRICS = ("psnr", "ssim", "lpips")
 
 
 @dataclass
@@ -115,7 +113,7 @@ class Tables:
                 }
                 paper[group] = {
                     f"table {number}, {way}, {100 * share:g}%": dict(
-                        zip(METRICS, figures, strict=True)
+                        zip(PUBLISHED_METRICS, figures, strict=True)
                     )
                     for number in (1, 3, 4)
                     for way, share in sorted(cells)

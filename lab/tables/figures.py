@@ -71,7 +71,7 @@ def main(
     if number == 4:
         tables = Tables.read(scenes[0])
         return plot_figure(tables.cells, tables.groups(), output)
-    tools = Tools(Options(views, side), Refiners(refiners))
+    tools = Tools(Options(views, side, fine_tune=300), Refiners(refiners))
     rows = []
     for path in scenes:
         scene = open_scene(path, data, tools.options)
@@ -83,7 +83,7 @@ def main(
                 raise PointSplatError(f"{maker.name}: {way.label} cannot be drawn: {why}")
             label = f"{way.label}, {percent(share)}"
             label += "" if way.opacity_weight is None else f", lambda {way.opacity_weight:g}"
-            made[label] = maker.make(way, share)[0][0]
+            made[label] = maker.make(way, share).scenes[0]
         photo = (
             {"photo": scene.held_out.photos[view]} if number == 3 and scene.held_out.photos else {}
         )

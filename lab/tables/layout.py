@@ -16,26 +16,30 @@ from lab.common.printing import markdown, number, percent
 from lab.common.results import Row
 from lab.tables.cells import FILES, Tables
 from lab.tables.figure import medians, plot_figure, share_of_figure
-from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
+from lab.tables.ways import PROTOCOL, PUBLISHED_METRICS, WAYS, Way, cell_key, published
 from pointsplat_ns.system.files import replacing, three_digits
 
 READING = (
     "Figures are means over the same scenes in all rows of a table, but for rows with a mark. "
     "PSNR (dB), SSIM and "
-    'LPIPS (AlexNet) are against held-out photos; those of "renders" against the dense scene\'s '
-    "own renders in the "
-    'same poses. "Loses most" names the scene that loses most PSNR compared to its dense scene, '
+    'LPIPS (AlexNet and VGG) are against held-out photos; those of "renders" against the dense '
+    "scene's own renders in the same poses. Networks of rows *unseen* saw other scenes only; those "
+    "of rows *own photos* were trained on the training photos of the same scenes. Fill is the mean "
+    'number of Gaussians that a viewer draws on a pixel. "Loses most" names the scene that loses most PSNR compared to its dense scene, '
     "with its PSNR and the difference; among dense scenes it is the one of the least PSNR. The "
     "spread is the standard deviation of PSNR over "
-    "trainings that differ by their seed. \\*: nothing is fine-tuned or refined. Frames a "
-    "second compare on an idle machine alone."
+    "trainings that differ by their seed. \\*: nothing is fine-tuned or refined. Milliseconds "
+    "compare on an idle machine alone."
 )
 
 OTHER_SCENES = "†"
 """Mark of a row whose means are over other scenes than those of the table."""
 
-WRITTEN = {"psnr": number(2), "ssim": number(3), "lpips": number(3)}
+WRITTEN = {"psnr": number(2), "ssim": number(3), "lpips": number(3), "lpips_vgg": number(3)}
 """How metrics are written."""
+
+HEADS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "lpips_vgg": "LPIPS VGG"}
+"""Their names in heads of tables."""
 
 Cell = tuple[Way, float]
 """A way, and the share of the Gaussians kept."""
@@ -97,8 +101,13 @@ class Layout:
             ("yes", "yes", ""),
             ("yes", "yes", "yes"),
         )
-        models = zip(("I", "II", "III", "IV", "V"), branches, WAYS.table_4, strict=True)
-        parts = [((name, *used), way, share) for name, used, way in models]
+        models = dict(zip(("I", "II", "III", "IV", "V"), branches, strict=True))
+        first_row, *refined = WAYS.table_4
+        names = ["I", *(name for name in [*models][1:] for _ in WAYS.pointsplat.protocols)]
+        parts = [
+            ((name, *models[name], way.saw), way, share)
+            for name, way in zip(names, (first_row, *refined), strict=True)
+        ]
         first = ("kept", "method")
         return [
             self._quality(
@@ -114,39 +123,36 @@ class Layout:
             self._quality(
                 4,
                 f"The dual-branch encoder, {percent(share)} kept",
-                ("model", "geometry", "appearance", "position"),
+                ("model", "geometry", "appearance", "position", "network saw"),
                 parts,
             ),
             *self._medians(),
         ]
 
     def _quality(self, which: int, title: str, first: tuple[str, ...], rows: list[tuple]) -> Table:
-        """A table of PSNR, SSIM, LPIPS, with the paper's PSNR and SSIM where dataset and protocol
-        are the paper's."""
+        """A table of PSNR, SSIM, LPIPS, with the paper's figures where dataset and protocol are the
+        paper's. LPIPS against renders is measured where there are no photos."""
         dataset = self.all.comparable(self.names)
         cells = [(way, share) for _, way, share in rows]
         theirs = {cell: published(which, dataset, cell[0].name, cell[1]) for cell in cells}
-        kinds = (["photos"] if self.has_photos else []) + ["renders"]
-        heads = [
-            name.upper() + " (renders)" * (kind == "renders") for kind in kinds for name in WRITTEN
-        ]
+        shown = [("renders", name) for name in WRITTEN]
+        if self.has_photos:
+            shown = [("photos", name) for name in WRITTEN] + shown[:2]
+        heads = [HEADS[name] + " (renders)" * (kind == "renders") for kind, name in shown]
         spread = ["spread"] * (which == 4)
-        paper = ["PSNR (paper)", "SSIM (paper)"] * any(theirs.values())
+        paper = [f"{HEADS[name]} (paper)" for name in PUBLISHED_METRICS] * any(theirs.values())
         heads += [*spread, "loses most", "made with", "scenes", *paper]
 
         def figures(same: pd.DataFrame, mean: pd.Series) -> list[str]:
-            found = [
-                _text(write, mean[f"{kind}_{name}"])
-                for kind in kinds
-                for name, write in WRITTEN.items()
-            ]
+            found = [_text(WRITTEN[name], mean[f"{kind}_{name}"]) for kind, name in shown]
             found += [_spread(same)] * (which == 4)
             return [*found, _worst(same), ", ".join(dict.fromkeys(map(_made, same["made_with"])))]
 
         def more(cell: Cell) -> list[str]:
-            known = (theirs[cell] or (None, None))[:2]
+            known = theirs[cell] or (None,) * len(PUBLISHED_METRICS)
             return [
-                _text(write, value) for write, value in zip(WRITTEN.values(), known, strict=False)
+                _text(WRITTEN[name], value)
+                for name, value in zip(PUBLISHED_METRICS, known, strict=True)
             ]
 
         return self._table(
@@ -155,14 +161,16 @@ class Layout:
 
     def _efficiency(self, first: tuple[str, ...], rows: list[tuple]) -> Table:
         def figures(same: pd.DataFrame, mean: pd.Series) -> list[str]:
-            frames = (1000 / same["frame_ms"]).mean()
-            return [f"{mean['gaussians']:,.0f}", f"{frames:.3g}", three_digits(mean["bytes"] / 1e6)]
+            costs = [
+                _text(number(1), mean[name]) for name in ("frame_ms", "frame_ms_torch", "fill")
+            ]
+            return [f"{mean['gaussians']:,.0f}", three_digits(mean["bytes"] / 1e6), *costs]
 
         return self._table(
             2,
             "Efficiency",
             first,
-            ["Gaussians", "frames a second", "MB", "scenes"],
+            ["Gaussians", "MB", "ms a frame", "ms, torch alone", "fill", "scenes"],
             rows,
             figures,
             None,
@@ -197,7 +205,8 @@ class Layout:
         for words, way, share in rows:
             names = scenes[way, share]
             if not names:
-                cells = ["not measured"] + ["-"] * (len(heads) - 1 - 2 * (more is not None))
+                extra = len(PUBLISHED_METRICS) * (more is not None)
+                cells = ["not measured"] + ["-"] * (len(heads) - 1 - extra)
             else:
                 comparable = over <= names
                 same = self.frame.loc[way.name, share].loc[sorted(over if comparable else names)]
@@ -272,8 +281,11 @@ def _flat(key: str, cell: Row) -> Row:
             f"{kind}_{name}": float("nan") if (v := found.get(name)) is None else v
             for name in WRITTEN
         }
-    more = {"trainings": cell.get("psnr", []), "made_with": cell["made_with"]}
-    return row | {"frame_ms": point["frame_ms"], **more}
+    costs = {
+        name: float("nan") if (v := point.get(name)) is None else v
+        for name in ("frame_ms", "frame_ms_torch", "fill")
+    }
+    return row | costs | {"trainings": cell.get("psnr", []), "made_with": cell["made_with"]}
 
 
 def _text(write: Any, value: float | None) -> str:
@@ -376,8 +388,8 @@ def _markdown(tables: Tables, made_tables: dict[str, list[Table]]) -> str:
             lines.append(list(map(escaped, line)))
         if tables.dataset(names) and tables.comparable(names):
             parts_of_paper = (
-                "The paper does not say of which scenes its Table 2 and Figure 4 are; its LPIPS "
-                "is by VGG."
+                "The paper does not say of which scenes its Table 2 and Figure 4 are, nor by which "
+                "network its LPIPS is; the released code takes VGG."
             )
             parts.append(parts_of_paper)
         parts += [

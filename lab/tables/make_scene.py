@@ -4,35 +4,32 @@ splat-transform, the peer of merging. Tells its tools, or the reason why it cann
 from __future__ import annotations
 
 import functools
-import itertools
 import math
-import random
+import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 import pointsplat_ns as ps
 from lab.common.ways import SplatTransform
+from lab.tables.fine_tune import FINE_TUNING, REDUCED, Curve, fine_tuned
 from lab.tables.scenes import OpenedScene, Options
-from lab.tables.ways import PROTOCOL, WAYS, Network, Way
-from pointsplat_ns.pipeline.optimiser import RATES, Adam, AdamSettings, optimised
-from pointsplat_ns.pipeline.photos.examples import Example
+from lab.tables.ways import WAYS, Network, Way
 from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.pruning import method_named, resolve_keep, score_of, select
 from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT
 from pointsplat_ns.refinement import read_metadata
-from pointsplat_ns.rendering import render
+from pointsplat_ns.refinement.weights import shipped_refiner
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import write_ply
 from pointsplat_ns.scene.reading import source_file
-from pointsplat_ns.scene.runs import RUN_FILES
+from pointsplat_ns.scene.runs import RUN_FILES, is_refiner_method
 
 
 class Tools:
@@ -57,7 +54,7 @@ class Tools:
                 return f"splat-transform cannot be run ({self.peer.missing})"
             if way.mode >= len(self.peer.modes):
                 return f"splat-transform {self.peer.version} has no such mode"
-        return "" if way.network is None else self.refiners.find(way.network, share, scene)[1]
+        return self.refiners.find(way, share, scene)[1]
 
     def made_with(self, way: Way, share: float, scene: str) -> str:
         """Text on the tools of a measurable cell. A measured cell with the same text need not be
@@ -65,20 +62,29 @@ class Tools:
         if way.mode is not None:
             return self.peer.modes[way.mode].label
         if way.network is not None:
-            return made_with(self.refiners.find(way.network, share, scene)[0])
-        return f"{self.options.fine_tune} steps" if way.fine_tuned else ""
+            return made_with(self.refiners.find(way, share, scene)[0])
+        return FINE_TUNING[way.by].words(share, self.options.fine_tune) if way.fine_tuned else ""
 
     def words(self, way: Way, share: float, scene: str) -> list[str]:
         """The options of the command that measures a cell with the same tools."""
         words = self.options.words
         if way.network is not None:
-            words += [
-                "--refiners",
-                *(str(each.path) for each in self.refiners.find(way.network, share, scene)[0]),
-            ]
+            found = self.refiners.find(way, share, scene)[0]
+            words += ["--refiners", *(str(each.path) for each in found)]
         if way.mode is not None and self.program:
             words += ["--splat-transform", self.program]
         return words
+
+
+@dataclass(frozen=True)
+class Made:
+    """The scene of a cell, one of each network where several fit."""
+
+    scenes: list[Gaussians]
+    seconds: float
+    """Seconds of making one, with those of scores that other cells share."""
+    curve: Curve = field(default_factory=list)
+    """PSNR over the steps of fine-tuning; empty without."""
 
 
 class Maker:
@@ -91,15 +97,14 @@ class Maker:
         self.tools = tools
         self._scores: dict[tuple[str, float | None], tuple[Tensor, float]] = {}
 
-    def make(self, way: Way, share: float) -> tuple[list[Gaussians], float]:
-        """The scene of a measurable cell, one of each network where several fit, and the seconds of
-        making one, with those of scores that other cells share. Raises ProgramFailed if another
-        program fails, SceneError if its result cannot be read or the SH degree exceeds the
-        refiner's, and DataError if there are no views."""
+    def make(self, way: Way, share: float) -> Made:
+        """The scene of a measurable cell. Raises ProgramFailed if another program fails, SceneError
+        if its result cannot be read or the SH degree exceeds the refiner's, and DataError if there
+        are no views."""
         dense = self.scene.dense
         start = time.perf_counter()
         if way == WAYS.dense:
-            return [dense], 0.0
+            return Made([dense], 0.0)
         count = resolve_keep(len(dense), share, dense.sh_degree)
         path = self.scene.path
         data = self.scene.data
@@ -109,58 +114,58 @@ class Maker:
                 scene, usage = self.tools.peer.modes[way.mode].reduce(
                     Path(folder) / "dense.ply", count, timeout=7200.0
                 )
-            return [scene.to(dense.device)], usage.seconds
+            return Made([scene.to(dense.device)], usage.seconds)
         if way.repaired:
-            return [ps.compact(path, count, data=data).scene], time.perf_counter() - start
+            return Made([ps.compact(path, count, data=data).scene], time.perf_counter() - start)
         if method_named(way.by).score is None:
-            return [ps.prune(path, count, way.by, data=data)], time.perf_counter() - start
+            return Made([ps.prune(path, count, way.by, data=data)], time.perf_counter() - start)
+        if way.fine_tuned:
+            return self._fine_tuned(way, share)
         scores, before = self._scored(way)
         start = time.perf_counter()
         scene = dense[select(scores, count)]
         made = [scene]
         if way.network is not None:
             made = [
-                each.refiner(scene)
-                for each in self.tools.refiners.find(way.network, share, self.name)[0]
+                each.refiner(scene, share)
+                for each in self.tools.refiners.find(way, share, self.name)[0]
             ]
-        if way.fine_tuned:
-            made = [fine_tuned(scene, dense, self.scene, self.tools.options.fine_tune)]
-        return made, before + (time.perf_counter() - start) / len(made)
+        return Made(made, before + (time.perf_counter() - start) / len(made))
+
+    def _fine_tuned(self, way: Way, share: float) -> Made:
+        """The scene after all rounds of pruning and fine-tuning. Scores of the first round are
+        those of the dense scene."""
+        settings = FINE_TUNING[way.by]
+        steps = self.tools.options.fine_tune
+        dense = self.scene.dense
+        last = dense
+        curve: Curve = []
+        seconds = 0.0
+        for number, kept in enumerate(settings.shares(share)):
+            scores, spent = self._scored(way) if number == 0 else self._score(way, last)
+            last = last[select(scores, resolve_keep(len(dense), kept, dense.sh_degree))]
+            last, points, more = fine_tuned(last, self.scene, settings, steps)
+            curve += [(number * steps + step, psnr) for step, psnr in points]
+            seconds += spent + more
+        return Made([last], seconds, curve)
 
     def _scored(self, way: Way) -> tuple[Tensor, float]:
-        """Scores (N,), and the seconds of computing them."""
+        """Scores (N,) of the dense scene, and the seconds of computing them."""
         key = way.by, way.opacity_weight
         if key not in self._scores:
-            method = method_named(way.by)
-            start = time.perf_counter()
-            views = (
-                self.scene.training.views.spread(self.tools.options.scoring_views)
-                if method.needs_views
-                else None
-            )
-            scores = score_of(self.scene.dense, method, views, way.opacity_weight)
-            self._scores[key] = scores, time.perf_counter() - start
+            self._scores[key] = self._score(way, self.scene.dense)
         return self._scores[key]
 
-
-def fine_tuned(small: Gaussians, dense: Gaussians, scene: OpenedScene, steps: int) -> Gaussians:
-    """The recovery step of the baselines: steps of Adam on 0.8 L1 + 0.2 (1 - SSIM) against training
-    photos, or renders of the dense scene where there are no photos. Each view comes once before any
-    is repeated."""
-
-    def examples() -> Iterator[Callable[[], Example]]:
-        (views, photos) = (scene.training.views, scene.training.photos)
-        order = random.Random(PROTOCOL.seed)
-        with torch.no_grad():
-            targets = photos or [render(dense, view) for view in views]
-        while True:
-            for index in reversed(order.sample(range(len(views)), len(views))):
-                yield functools.partial(Example, views[index], targets[index].to(small.means))
-
-    scenes = optimised(
-        small, Adam(small, AdamSettings(), RATES), examples(), pixel_loss="l1", together=1
-    )
-    return next(itertools.islice(scenes, steps - 1, None))
+    def _score(self, way: Way, scene: Gaussians) -> tuple[Tensor, float]:
+        """Scores (K,) of a scene, and the seconds of computing them."""
+        method = method_named(way.by)
+        start = time.perf_counter()
+        views = self.scene.training.views
+        if self.tools.options.scoring_views is not None:
+            views = views.spread(self.tools.options.scoring_views)
+        views = views.resized(max(1, max(views.width, views.height) // REDUCED.get(way.by, 1)))
+        scores = score_of(scene, method, views if method.needs_views else None, way.opacity_weight)
+        return scores, time.perf_counter() - start
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,35 +229,78 @@ def made_with(all_weights: Sequence[Weights]) -> str:
 
 
 class Refiners:
-    """Weights to choose from; paths and errors are those of :func:`pointsplat_ns.load_refiner`."""
+    """Weights to choose from: those that ship for selections (``shipped``), files, runs, and the
+    newest run of each name at any depth below a folder. Errors are those of
+    :func:`pointsplat_ns.load_refiner`."""
 
     def __init__(self, paths: Sequence[Path]):
         self.all = tuple(_read(path) for given in paths for path in _trained(given))
 
-    def find(self, network: Network, share: float, scene: str) -> tuple[list[Weights], str]:
-        """The weights for a row (the needed network, a share of the Gaussians, the name of a
-        scene), or the reason for none. They were trained for this network and this share, and not
-        on the scene itself. Of several kinds the first is taken; those of a kind differ by their
-        seed."""
+    def find(self, way: Way, share: float, scene: str) -> tuple[list[Weights], str]:
+        """The weights for a row (a way, a share of the Gaussians, the name of a scene), or the
+        reason for none, which is empty for ways without a network. They were trained for this
+        network and this share; not on the scene itself, or for rows of own photos on its training
+        photos. Of several kinds the first is taken; those of a kind differ by their seed."""
+        network = way.network
+        if network is None:
+            return [], ""
         fitting = [
             weights
             for weights in self.all
             if weights.network == network
             and any(math.isclose(keep, share, rel_tol=1e-3) for keep in weights.keeps)
         ]
-        if unseen := [weights for weights in fitting if scene not in weights.trained_on]:
-            return [weights for weights in unseen if weights.kind == unseen[0].kind], ""
+        reasons = {weights.path: _unfit(weights, way.own, scene) for weights in fitting}
+        if fit := [weights for weights in fitting if not reasons[weights.path]]:
+            return [weights for weights in fit if weights.kind == fit[0].kind], ""
         if fitting:
-            return [], f"its weights ({fitting[0].path}) were trained on this scene"
-        missing = f"no weights were given (--refiners) of a {network}, to {100 * share:g} %"
-        return [], f"{missing}; to train them: {network.command(share)}"
+            path, why = next(iter(reasons.items()))
+            return [], f"its weights ({path}) {why}"
+        of = "these scenes' photos" if way.own else "other scenes"
+        missing = (
+            f"no weights were given (--refiners) of a {network}, to {100 * share:g} %, on {of}"
+        )
+        return [], f"{missing}; to train them: {network.command(share, way.own)}"
+
+
+def _unfit(weights: Weights, own: bool, scene: str) -> str:
+    """The reason why weights that fit a row otherwise do not fit its protocol; empty if they do."""
+    if not weights.trained_on:
+        return "do not say which scenes they were trained on"
+    if not own:
+        return "were trained on this scene" if scene in weights.trained_on else ""
+    if scene not in weights.trained_on:
+        return "were not trained on this scene"
+    seen = weights.training.get("supervision")
+    return "" if seen == "photos" else f"were trained on {seen or 'unknown'} targets, not on photos"
 
 
 def _trained(path: Path) -> list[Path]:
-    """Finished trainings below a folder that is no run itself; or the path."""
-    if path.is_dir() and not (path / RUN_FILES.config).is_file():
-        return sorted(file.parent for file in path.glob(f"*/*/*/{RUN_FILES.refiner}")) or [path]
-    return [path]
+    """The newest finished training of each name below a folder that is no run itself; or the
+    path."""
+    if str(path) == "shipped":
+        return [shipped_refiner("paper")]
+    is_run = any((path / name).is_file() for name in (RUN_FILES.config, RUN_FILES.refiner))
+    if not path.is_dir() or is_run:
+        return [path]
+    newest: dict[Path, Path] = {}
+    for place, inner, files in os.walk(path):
+        inner[:] = sorted(name for name in inner if not name.startswith("."))
+        if RUN_FILES.refiner not in files:
+            continue
+        inner.clear()  # no search inside of a run
+        run = Path(place)
+        # EXPERIMENT/METHOD/TIME, or a folder that was moved out of that layout
+        name = run.parents[1] if is_refiner_method(run.parent.name) else run
+        known = newest.get(name)
+        if known is None or _when(run) > _when(known):
+            newest[name] = run
+    return sorted(newest.values()) or [path]
+
+
+def _when(run: Path) -> tuple[float, str]:
+    """Sort key of a training's age: when its weights were written."""
+    return (run / RUN_FILES.refiner).stat().st_mtime, run.name
 
 
 def _read(path: Path) -> Weights:

@@ -12,29 +12,32 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean, median
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
 
 import pointsplat_ns
-from lab.common.compare import lpips_or_none, metrics_of
+from lab.common.compare import metrics_of
 from lab.common.results import Row
 from lab.tables.cells import Tables
 from lab.tables.figure import distributions
+from lab.tables.fine_tune import PUBLISHED_STEPS
 from lab.tables.layout import write_tables
 from lab.tables.make_scene import Maker, Refiners, Tools
 from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.metrics import MOST_PSNR
+from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering import rasterization, render
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
+from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import source_file
 from pointsplat_ns.scene.runs import may_be_run, name_of, open_run
-from pointsplat_ns.scene.views import View
+from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system.files import logger, need_folder
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.tools.tradeoff.measuring import machine_text
@@ -42,43 +45,104 @@ from pointsplat_ns.tools.tradeoff.measuring import machine_text
 ROUNDS = 3
 """Number of timed frames of each view; the fastest counts."""
 
+TORCH = 2, 2
+"""Numbers of views and of rounds in which frames are timed without compiled kernels, which take
+several times as long."""
+
+Net = Literal["alex", "vgg"]
+
+LPIPS = {"alex": "lpips", "vgg": "lpips_vgg"}
+"""Names of LPIPS in cells, by its network."""
+
+
+def networks_at_hand(nets: Sequence[Net]) -> dict[str, Lpips]:
+    """LPIPS by its name in cells, of the networks whose weights are at hand; says which are
+    not."""
+    found = {}
+    for net in nets:
+        try:
+            found[LPIPS[net]] = load_lpips(net, download=False)
+        except LpipsUnavailable as error:
+            logger.warning("no LPIPS by %s: %s", net, error)
+    return found
+
 
 class Judge:
-    """Measures smaller scenes in the held-out views of one scene, whose renders are made once."""
+    """Measures smaller scenes in the held-out views of one scene, whose renders are made once.
+
+    Args:
+        scene: with its views and photos.
+        lpips: LPIPS by its name in cells.
+    """
 
     @torch.no_grad()
-    def __init__(self, scene: OpenedScene):
+    def __init__(self, scene: OpenedScene, lpips: dict[str, Lpips]):
         self.scene = scene
         self.reference = DenseReference(scene.dense, scene.held_out.views)
-        self.lpips = lpips_or_none(True)
+        self.lpips = lpips
 
     @torch.no_grad()
-    def figures(self, small: Gaussians) -> Row:
-        """PSNR, SSIM and LPIPS against renders of the dense scene and against photos, and
-        milliseconds of a frame."""
+    def figures(self, small: Gaussians, timed: bool) -> Row:
+        """PSNR, SSIM and LPIPS against renders of the dense scene and against photos (LPIPS only
+        against photos, where there are some), fill, and milliseconds of a frame; with ``timed``
+        also of one that torch alone draws."""
         views = self.scene.held_out.views
         photos = self.scene.held_out.photos
         images = [render(small, view) for view in views]
-        against = {"against_dense": self._means(images, self.reference.renders)}
-        against["against_photos"] = None if photos is None else self._means(images, photos)
+        nets = self.lpips if photos is None else {}
+        against = {"against_dense": _means(images, self.reference.renders, nets)}
+        against["against_photos"] = None if photos is None else _means(images, photos, self.lpips)
         psnr = min(self.reference.closeness_of(images).psnr, MOST_PSNR)
         against["against_dense"]["psnr"] = None if small is self.scene.dense else psnr
-        frame_ms = 1e3 * median(min(_seconds(small, view) for _ in range(ROUNDS)) for view in views)
-        return {**against, "frame_ms": frame_ms}
-
-    def _means(self, images: Sequence[torch.Tensor], targets: Sequence[torch.Tensor]) -> Row:
-        found = [
-            metrics_of(image, target.to(image), self.lpips)
-            for image, target in zip(images, targets, strict=True)
-        ]
-        return {"lpips": None} | {
-            name: fmean(metrics[name] for metrics in found) for name in found[0]
+        return {
+            **against,
+            "fill": fill(small, views),
+            "frame_ms": _frame_ms(small, views, ROUNDS, compiled=True),
+            "frame_ms_torch": _frame_ms(small, views.spread(TORCH[0]), TORCH[1], compiled=False)
+            if timed
+            else None,
         }
 
 
-def _seconds(scene: Gaussians, view: View) -> float:
+def _means(
+    images: Sequence[torch.Tensor], targets: Sequence[torch.Tensor], nets: dict[str, Lpips]
+) -> Row:
+    """Means over views of PSNR, SSIM and LPIPS; None for LPIPS without its network."""
+    found = []
+    for image, target in zip(images, targets, strict=True):
+        close = metrics_of(image, target.to(image), None)
+        for name, net in nets.items():
+            close[name] = float(net(image, target.to(image)))
+        found.append(close)
+    return dict.fromkeys(LPIPS.values()) | {
+        name: fmean(metrics[name] for metrics in found) for name in found[0]
+    }
+
+
+def _frame_ms(scene: Gaussians, views: Views, rounds: int, compiled: bool) -> float:
+    """Milliseconds of a frame: the median over views of the fastest of some rounds."""
+
+    def fastest(view: View) -> float:
+        return min(_seconds(scene, view, compiled) for _ in range(rounds))
+
+    return 1e3 * median(map(fastest, views))
+
+
+def _seconds(scene: Gaussians, view: View, compiled: bool) -> float:
+    """Seconds of a picture, by compiled kernels where there are some, or by torch alone."""
     start = time.perf_counter()
-    render(scene, view)
+    if compiled:
+        render(scene, view)
+    else:
+        rasterization(
+            *(scene.means, scene.quats, scene.stds, scene.alphas, scene.sh),
+            viewmats=view.viewmat[None],
+            Ks=view.K[None],
+            width=view.width,
+            height=view.height,
+            sh_degree=scene.sh_degree,
+            compiled=False,
+        )
     return time.perf_counter() - start
 
 
@@ -89,9 +153,12 @@ def measured(
     command that measures it again."""
     name = maker.name
     tools = maker.tools
-    made, seconds = maker.make(way, share)
-    small = made[0]
-    figures = [judge.figures(each) for each in made]
+    made = maker.make(way, share)
+    small = made.scenes[0]
+    timed = way == WAYS.dense or way in WAYS.table_2
+    start = time.perf_counter()
+    figures = [judge.figures(each, timed) for each in made.scenes]
+    judged = time.perf_counter() - start
     key = cell_key(name, way, share)
     size = ply_bytes(len(small), small.sh_degree)
     words = [str(scene.path), "-o", str(output), "--only", key, *tools.words(way, share, name)]
@@ -105,10 +172,12 @@ def measured(
         "gaussians": len(small),
         "sh_degree": small.sh_degree,
         "bytes": size,
-        "seconds": seconds,
+        "seconds": made.seconds,
+        "judged": judged / len(figures),
     }
     opacities, volumes = distributions(small) if way in WAYS.figure_4 else (None, None)
     cell: Row = {"way": way.name, "point": point | _mean(figures)}
+    cell["curve"] = made.curve
     cell["psnr"] = [
         (found["against_photos"] or found["against_dense"])["psnr"] for found in figures
     ]
@@ -136,10 +205,11 @@ def measure_tables(
     refiners: tuple[Path, ...] = (),
     groups: tuple[str, ...] = (),
     only: tuple[str, ...] = (),
-    views: int = 10,
-    side: int = 640,
-    scoring_views: int = 40,
-    fine_tune: int = 300,
+    views: int | None = None,
+    side: int | None = None,
+    scoring_views: int | None = None,
+    fine_tune: int = PUBLISHED_STEPS,
+    lpips: tuple[Net, ...] = ("alex", "vgg"),
     splat_transform: str | None = None,
     data: Path | None = None,
     force: bool = False,
@@ -156,17 +226,20 @@ def measure_tables(
             they are found; or files of scenes.
         output: folder for tables.json with all cells, tables.md and figure4.png.
         keeps: shares of the Gaussians in Tables 1 and 2.
-        refiners: weights for the rows with a network: runs, .safetensors files, or folders above
-            runs. Each row takes those with fitting metadata; of those that differ by their seed,
-            the mean.
+        refiners: weights for the rows with a network: .safetensors files, runs, folders above runs
+            at any depth, of which the newest of each name count, or "shipped", those that ship for
+            selections. Each row takes those with fitting metadata; of those that differ by their
+            seed, the mean.
         groups: NAME=SCENE,SCENE...; means are taken over groups.
         only: names or patterns of cells, such as fox/merge/10%. Only these are measured, also if
             they were before.
-        views: largest number of held-out views of a scene.
-        side: largest side of all images, pixels; photos are reduced.
+        views: largest number of held-out views of a scene; by default all.
+        side: largest side of all images, pixels; photos are reduced. By default full size.
         scoring_views: largest number of training poses for the scores of LightGaussian and
-            PUP-3DGS.
-        fine_tune: steps of fine-tuning, against at most 60 training photos.
+            PUP-3DGS; by default all.
+        fine_tune: steps of fine-tuning after each pruning; by default those of the publications.
+        lpips: networks of LPIPS whose weights are at hand. By VGG it takes ten times as long as all
+            else of a cell without fine-tuning.
         splat_transform: path of the program; by default the one on PATH.
         data: folder above the data of the runs, or that of one, where it is no longer where the
             runs say; a run whose data is not found is measured without photos, with a warning.
@@ -193,10 +266,12 @@ def measure_tables(
     for name, path in paths.items():
         tables.enter(name, _about(path, data, options), _groups(groups, paths).get(name))
     tables.missing = {}
-    wanted = _wanted(tables, paths, keeps, tools, only)
+    networks = networks_at_hand(lpips)
+    wanted = _wanted(tables, paths, keeps, tools, only, networks)
     try:
         for name, cells in tracked(wanted.items(), "measuring", len(wanted)):
-            _measure(tables, output, name, open_scene(paths[name], data, options), cells, tools)
+            judge = Judge(open_scene(paths[name], data, options), networks)
+            _measure(tables, output, name, judge, cells, tools)
     finally:
         write_tables(tables, output, keeps)
     print(f"{output}: tables.md, tables.json and figure4.png")
@@ -207,12 +282,13 @@ def _measure(
     tables: Tables,
     output: Path,
     name: str,
-    scene: OpenedScene,
+    judge: Judge,
     cells: list[tuple[Way, float]],
     tools: Tools,
 ) -> None:
     """Measure cells of a scene and write each. A cell that cannot be made is left out, with the
     reason."""
+    scene = judge.scene
     shown = scene.held_out.views
     about = {
         "views": len(shown),
@@ -222,7 +298,6 @@ def _measure(
     }
     tables.scenes[name] |= about | {"differs": "; ".join(scene.differs)}
     maker = Maker(scene, name, tools)
-    judge = Judge(scene)
     for way, share in cells:
         key = cell_key(name, way, share)
         try:
@@ -290,6 +365,7 @@ def _wanted(
     keeps: Sequence[float],
     tools: Tools,
     only: Sequence[str],
+    networks: dict[str, Lpips],
 ) -> dict[str, list[tuple[Way, float]]]:
     """The cells to measure, by scene: those that ``only`` names, or that lack a measurement with
     the same tools. What cannot be measured is noted with the reason. Raises PointSplatError if
@@ -305,13 +381,24 @@ def _wanted(
             known = tables.cells.get(key)
             if why := tools.missing(way, share, name):
                 tables.missing[key] = why
-            elif only or known is None or known["made_with"] != tools.made_with(way, share, name):
+            elif (
+                only
+                or known is None
+                or _outdated(known, tools.made_with(way, share, name), networks)
+            ):
                 wanted.setdefault(name, []).append((way, share))
     if not named:
         raise PointSplatError(
             f"{', '.join(only)}: no such cell; expected a name such as fox/merge/10%, or a pattern"
         )
     return wanted
+
+
+def _outdated(cell: Row, made_with: str, networks: dict[str, Lpips]) -> bool:
+    """Whether a cell was made with other tools, or lacks LPIPS by a network at hand."""
+    point = cell["point"]
+    found = point["against_photos"] or point["against_dense"]
+    return cell["made_with"] != made_with or any(found.get(name) is None for name in networks)
 
 
 @functools.cache

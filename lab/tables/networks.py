@@ -70,10 +70,15 @@ class Job:
         return f"{self.way.name}-{100 * self.share:g}" + (f"-seed{self.seed}" if self.seed else "")
 
 
-def jobs(seeds: int = 1) -> list[Job]:
-    """All networks: sixteen, and those of Table 4 again with each further seed."""
-    found = [Job(way, share) for way, share in WAYS.cells(PROTOCOL.shares) if way.network]
-    ablated = [way for way in WAYS.table_4 if way.network]
+def jobs(seeds: int = 1, own: bool = False) -> list[Job]:
+    """All networks of a protocol, *unseen* or *own photos*: sixteen, and those of Table 4 again
+    with each further seed."""
+
+    def wanted(way: Way) -> bool:
+        return way.network is not None and way.own == own
+
+    found = [Job(way, share) for way, share in WAYS.cells(PROTOCOL.shares) if wanted(way)]
+    ablated = [way for way in WAYS.table_4 if wanted(way)]
     return found + [
         Job(way, PROTOCOL.ablation_share, seed) for seed in range(1, seeds) for way in ablated
     ]
@@ -83,6 +88,7 @@ def main(
     scenes: tyro.conf.Positional[Path],
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     held_out: tuple[str, ...] = (),
+    own: bool = False,
     training: Literal["small", "paper"] = "small",
     size: Literal["tiny", "small", "full"] | None = None,
     steps: int | None = None,
@@ -94,9 +100,10 @@ def main(
     """Train all networks of Tables 1, 3 and 4 that OUTPUT lacks.
 
     Args:
-        scenes: folder above trained runs.
+        scenes: folder above trained runs; with --own, of the scenes of the tables and no others.
         output: folder for the networks, for ``python -m lab.tables --refiners``.
         held_out: names of scenes that no network is trained on: those of the tables.
+        own: train the networks of the rows "own photos", on the training photos of the scenes.
         training: "paper", as published, which needs a GPU; or "small", for CPUs.
         size: size of the networks, in place of the training's.
         steps: steps of each network, in place of the training's.
@@ -109,7 +116,7 @@ def main(
     part, slash, parts = shard.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
         raise PointSplatError(f"--shard {shard}: expected I/N such as 1/3, with I from 1 to N")
-    every = jobs(seeds)
+    every = jobs(seeds, own)
     if seconds is not None and in_all:
         seconds /= len(every)
     chosen = TRAININGS[training]
@@ -121,7 +128,9 @@ def main(
             continue
         assert job.way.network is not None
         needs = (
-            options | job.way.network.options(job.share) | {"pipeline.datamanager.seed": job.seed}
+            options
+            | job.way.network.options(job.share, own)
+            | {"pipeline.datamanager.seed": job.seed}
         )
         left = steps or chosen.steps
         try:

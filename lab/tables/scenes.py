@@ -28,25 +28,21 @@ class Options:
     """What measurements depend on beside the scene. Raises PointSplatError if an option is below
     1."""
 
-    views: int = 10
-    """Largest number of held-out views of a scene."""
-    side: int = 640
-    """Longer side of the images for judging, fine-tuning and scoring, at most, pixels."""
-    scoring_views: int = 40
-    """Largest number of training poses for the scores of LightGaussian and PUP-3DGS."""
-    fine_tune: int = 300
-    """Steps of fine-tuning."""
+    views: int | None = None
+    """Largest number of held-out views of a scene; None for all."""
+    side: int | None = None
+    """Longer side of the images for judging, fine-tuning and scoring, at most, pixels; None for
+    full size."""
+    scoring_views: int | None = None
+    """Largest number of training poses for the scores of LightGaussian and PUP-3DGS; None for
+    all."""
+    fine_tune: int = 5_000
+    """Steps of fine-tuning after each pruning; by default those of both publications."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if value < 1:
+            if value is not None and value < 1:
                 raise PointSplatError(f"{name.replace('_', ' ')}: {value}; expected at least 1")
-
-    @property
-    def training_views(self) -> int:
-        """Largest number of views for fine-tuning and scoring. Their photos are in memory, at first
-        in full size."""
-        return max(60, self.scoring_views)
 
     @property
     def words(self) -> list[str]:
@@ -60,6 +56,13 @@ class Options:
         ]
 
 
+ALL = 1 << 30
+"""More photos than any dataset has."""
+
+SAMPLED = 10, 60
+"""Numbers of sampled views to judge, and to score and fine-tune, a scene without photos."""
+
+
 @dataclass(frozen=True)
 class Pictures:
     """Views, and the photos (H, W, 3) that show the same, if there are some."""
@@ -67,10 +70,10 @@ class Pictures:
     views: Views
     photos: list[Tensor] | None = None
 
-    def resized(self, side: int) -> Pictures:
-        """The same with at most ``side`` pixels on the longer side; photos are averaged over the
-        areas of pixels."""
-        views = self.views.resized(side)
+    def resized(self, side: int | None) -> Pictures:
+        """The same with at most ``side`` pixels on the longer side, None for any; photos are
+        averaged over the areas of pixels."""
+        views = self.views if side is None else self.views.resized(side)
         if self.photos is None or views is self.views:
             return Pictures(views, self.photos)
         size = (views.height, views.width)
@@ -106,11 +109,9 @@ def open_scene(path: Path, data: Path | None, options: Options) -> OpenedScene:
     need_usable(dense)
     if may_be_run(path):
         try:
-            whole = Pictures(*dataset_photos(path, "test", options.views, data))
+            whole = Pictures(*dataset_photos(path, "test", options.views or ALL, data))
             held_out = whole.resized(options.side)
-            training = Pictures(
-                *dataset_photos(path, "train", options.training_views, data)
-            ).resized(options.side)
+            training = Pictures(*dataset_photos(path, "train", ALL, data)).resized(options.side)
             size = held_out.views.width, whole.views.width
             differs = differences(
                 open_run(path, data=data), dense.sh_degree, len(held_out.views), size
@@ -118,8 +119,10 @@ def open_scene(path: Path, data: Path | None, options: Options) -> OpenedScene:
             return OpenedScene(path, data, dense, held_out, training, "held-out photos", differs)
         except (SceneError, DataError) as error:
             logger.warning("%s: no photos to compare with: %s", path, error)
-    held_out = Pictures(ps.sample_views(dense, options.views, seed=1)).resized(options.side)
-    training = Pictures(ps.sample_views(dense, options.training_views)).resized(options.side)
+    judging, training_views = SAMPLED
+    views = ps.sample_views(dense, options.views or judging, seed=1)
+    held_out = Pictures(views).resized(options.side)
+    training = Pictures(ps.sample_views(dense, training_views)).resized(options.side)
     return OpenedScene(
         path, data, dense, held_out, training, "sampled views", ("no held-out photos",)
     )
@@ -159,8 +162,8 @@ def paper_dataset(run: Run) -> str:
     "ScanNet++"; empty if it is another, or its data is gone."""
     parser = run.dataparser_class.rpartition(".")[2]
     name = run.data.name
-    # The scenes of NICE-SLAM's Replica, which the paper follows; it does not say which three it
-    # tests on.
+    # The scenes of NICE-SLAM's Replica, which the paper follows; neither it nor the released code
+    # says which three it tests on.
     if parser == "ReplicaDataParserConfig" and re.fullmatch(r"room[0-2]|office[0-4]", name):
         try:
             scene = load_replica(run.data)

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT
@@ -12,7 +12,7 @@ from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT
 
 @dataclass(frozen=True)
 class Protocol:
-    """Settings of the paper's tables."""
+    """Settings of the paper's tables; :mod:`lab.tables.sources` says where each is stated."""
 
     shares: tuple[float, ...] = (0.5, 0.3, 0.1)
     """Shares of the Gaussians in Tables 1 and 2."""
@@ -23,7 +23,7 @@ class Protocol:
     datasets: tuple[str, ...] = ("ScanNet++", "Replica")
     """In the order of the paper's columns."""
     dense_steps: int = 15_000
-    """Number of Splatfacto's steps for a dense scene."""
+    """Number of Splatfacto's steps for a dense scene, in the README of the released code."""
     figure_share: float = 0.5
     """Share of the Gaussians in Figures 3 and 4."""
     seed: int = 0
@@ -52,28 +52,30 @@ class Network:
         words = f"{self.encoder} encoder" + (f" without {without}" if without else "")
         return f"{words}, trained on scenes pruned by {self.by}{weight}"
 
-    def options(self, share: float) -> dict[str, str]:
+    def options(self, share: float, own: bool = False) -> dict[str, str]:
         """The options of ``ns-train pointsplat`` that make such a network for a share of the
-        Gaussians."""
+        Gaussians; with ``own``, on training photos."""
         options = {"encoder": self.encoder, "by": self.by, "keep": f"{share:g}"}
         options |= (
             {} if self.opacity_weight is None else {"opacity-weight": f"{self.opacity_weight:g}"}
         )
         options |= {} if self.use_appearance else {"use-appearance": "False"}
         options |= {} if self.use_position else {"use-position": "False"}
-        return {f"pipeline.model.{name}": value for name, value in options.items()}
+        named = {f"pipeline.model.{name}": value for name, value in options.items()}
+        return named | ({"pipeline.datamanager.supervision": "photos"} if own else {})
 
-    def command(self, share: float) -> str:
-        """The command that trains such a network on scenes of the user's choice.
+    def command(self, share: float, own: bool = False) -> str:
+        """The command that trains such a network: on other scenes than those that are measured, or
+        on the training photos of these (``own``).
 
         Example:
             >>> Network("concat", "random", None).command(0.3)
-            'ns-train pointsplat --data SCENES --pipeline.model.encoder concat --pipeline.model.by
-            random \
---pipeline.model.keep 0.3'
+            'ns-train pointsplat --data OTHER_SCENES --pipeline.model.encoder concat \
+--pipeline.model.by random --pipeline.model.keep 0.3'
         """
-        words = " ".join(f"--{name} {value}" for name, value in self.options(share).items())
-        return f"ns-train pointsplat --data SCENES {words}"
+        words = " ".join(f"--{name} {value}" for name, value in self.options(share, own).items())
+        scenes = "THESE_SCENES" if own else "OTHER_SCENES"
+        return f"ns-train pointsplat --data {scenes} {words}"
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,28 @@ class Way:
     """Whether the scene is fine-tuned against its training photos."""
     network: Network | None = None
     """The refiner; None for none."""
+    own: bool = False
+    """Whether the refiner was trained on the training photos of the scenes that are measured, as
+    the released configuration for Replica does; if not, it saw other scenes only."""
     repaired: bool = False
     """Whether ``compact`` makes it."""
     mode: int | None = None
     """Index of splat-transform's mode; None for other ways."""
+
+    @property
+    def protocols(self) -> tuple[Way, ...]:
+        """This way, or for one with a network both protocols: *unseen* and *own photos*."""
+        if self.network is None:
+            return (self,)
+        unseen = replace(self, label=f"{self.label}, unseen")
+        return unseen, replace(
+            self, name=f"{self.name}-own", label=f"{self.label}, own photos", own=True
+        )
+
+    @property
+    def saw(self) -> str:
+        """What the network was trained on, in a cell of a table; empty without a network."""
+        return "" if self.network is None else "own photos" if self.own else "other scenes"
 
 
 @dataclass(frozen=True)
@@ -143,12 +163,14 @@ class Ways:
 
     @property
     def table_2(self) -> tuple[Way, ...]:
-        """The rows of Table 2 for each share."""
-        return (self.lightgaussian_tuned, self.pup_tuned, self.pointsplat, *self._not_of_the_paper)
+        """The rows of Table 2 for each share; those of the paper, its selection and ours."""
+        paper = (self.lightgaussian_tuned, self.pup_tuned, self.paper, *self.pointsplat.protocols)
+        return (*paper, *self._not_of_the_paper)
 
     @property
     def table_3(self) -> tuple[tuple[float, Way], ...]:
-        """Lambda and way of each row of Table 3: the paper's selection, and refined."""
+        """Lambda and way of each row of Table 3: the paper's selection, and refined, by both
+        protocols."""
         found: list[tuple[float, Way]] = []
         for weight in PROTOCOL.opacity_weights:
             selected = self.paper
@@ -163,12 +185,12 @@ class Ways:
                     weight,
                     network=network,
                 )
-            found += [(weight, selected), (weight, refined)]
+            found += [(weight, way) for way in (selected, *refined.protocols)]
         return tuple(found)
 
     @property
     def table_4(self) -> tuple[Way, ...]:
-        """Rows I to V of Table 4."""
+        """Rows I to V of Table 4; from II on by both protocols."""
         parts = {"ii": (False, False), "iii": (False, True), "iv": (True, False)}
         ablated = (
             Way(
@@ -179,7 +201,7 @@ class Ways:
             )
             for row, (first, second) in parts.items()
         )
-        return (self.paper, *ablated, self.pointsplat)
+        return (self.paper, *both(ablated), *self.pointsplat.protocols)
 
     @property
     def figure_4(self) -> tuple[Way, ...]:
@@ -199,11 +221,17 @@ class Ways:
 
     @property
     def _by_gaussians(self) -> tuple[Way, ...]:
-        return (self.splatformer, self.paper, self.paper_splatformer, self.pointsplat)
+        return tuple(both((self.splatformer, self.paper, self.paper_splatformer, self.pointsplat)))
 
     @property
     def _not_of_the_paper(self) -> tuple[Way, ...]:
         return (self.merge, self.compact, self.splat_transform, self.splat_transform_adaptive)
+
+
+def both(ways: Iterable[Way]) -> Iterator[Way]:
+    """Ways, those with a network by both protocols."""
+    for way in ways:
+        yield from way.protocols
 
 
 WAYS = Ways()
@@ -276,17 +304,21 @@ _PUBLISHED: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
 }
 """PSNR (dB), SSIM and LPIPS on ScanNet++, then on Replica, by table, way and share."""
 
+PUBLISHED_METRICS = ("psnr", "ssim", "lpips_vgg")
+"""Their names in cells: the released code measures LPIPS by VGG (``utils/metrics.py``)."""
+
 
 def published(
     table: int, dataset: str, way: str, share: float
 ) -> tuple[float, float, float] | None:
     """The paper's PSNR (dB), SSIM and LPIPS of a row, by its way and share, against held-out photos
-    in table 1, 3 or 4; None if there are none.
+    in table 1, 3 or 4; None if there are none. Rows of both protocols have the same: which one the
+    paper's are is not stated.
 
     Example:
         >>> published(1, "Replica", "pointsplat", 0.1)
         (29.81, 0.902, 0.276)
     """
-    figures = _PUBLISHED[table].get((way, share), ())
+    figures = _PUBLISHED[table].get((way.removesuffix("-own"), share), ())
     first = {"ScanNet++": 0, "Replica": 3}.get(dataset, len(figures))
     return figures[first : first + 3] or None  # type: ignore[return-value]

@@ -17,9 +17,7 @@ from pointsplat_ns.scene.ply import write_ply
 JUDGED = RECORD / "judge.json", RECORD / "judge_photos.json"
 
 PAGES = {
-    "results.md": lambda: tables_record.page(
-        tables_record.read(RECORD / "results.json"), RECORD / "encoders.json"
-    ),
+    "results.md": lambda: tables_record.page(tables_record.read(RECORD / "results.json"), RECORD),
     "speed.md": lambda: beside.page(json.loads((RECORD / "speed.json").read_text("utf-8"))["rows"]),
     "ablation.md": lambda: ablation.page(*record.read([RECORD / "ablation.json"], "ablation.py")),
     "large.md": lambda: large.page(json.loads((RECORD / "large.json").read_text("utf-8"))["rows"]),

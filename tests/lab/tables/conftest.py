@@ -28,7 +28,7 @@ def weights(tmp_path_factory) -> Callable[..., Path]:
         with torch.no_grad():
             [*network.heads.mlps["opacities"].modules()][-1].bias.fill_(0.5)
         path = folder / f"{name}.safetensors"
-        save_refiner(network, path, metadata)
+        save_refiner(network, path, {"scenes": "elsewhere", **metadata})
         return path
 
     return write

@@ -1,6 +1,7 @@
 """Tables of a small room, really measured: every way, what cannot be measured, and going on."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,8 @@ import pytest
 import pointsplat_ns as ps
 from lab.common.ways import SplatTransform
 from lab.tables.cells import Tables
+from lab.tables.fine_tune import FINE_TUNING
+from lab.tables.make_scene import Refiners
 from lab.tables.measure import Judge
 from lab.tables.ways import WAYS, Ways
 from making import box_room
@@ -29,8 +32,10 @@ def all_weights(weights):
     wanted = {way.network for way, _ in WAYS.cells((0.3,)) if way.network}
     return [
         weights(
-            f"{network.encoder}-{network.by}-{network.opacity_weight}-{network.use_appearance:d}{network.use_position:d}",
+            f"{network.encoder}-{network.by}-{network.opacity_weight}-{network.use_appearance:d}{network.use_position:d}-{scenes}",
             {
+                "scenes": scenes,
+                "supervision": "photos",
                 "by": network.by,
                 "keep": 0.1,
                 "more_keeps": [0.3],
@@ -42,12 +47,14 @@ def all_weights(weights):
             use_position=network.use_position,
         )
         for network in wanted
+        for scenes in ("elsewhere", "room")
     ]
 
 
 def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, tmp_path):
     tables = measured(refiners=all_weights, splat_transform=peer(tmp_path, "3.7.0"))
     cells = cells_of(tables)
+    timed = {"dense", *(way.name for way in WAYS.table_2)}
     assert {*cells} == {
         (way.name, share) for way, share in WAYS.cells((0.3,))
     } and tables.missing == {}
@@ -78,14 +85,21 @@ def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, tmp_
     made_with = {way: cell["made_with"] for (way, share), cell in cells.items() if share == 0.3}
     assert (
         made_with["splat-transform"] == "splat-transform 3.7.0 -d"
-        and made_with["pup-tuned"] == "2 steps"
+        and made_with["pup-tuned"] == "2 of 5,000 steps"
     )
     assert made_with["pointsplat"].endswith(
         "(664,563 parameters; norm by scene; dual encoder, trained on scenes pruned by paper, "
-        "lambda 0.3, keep 0.1, 0.3; steps 24)"
+        "lambda 0.3, keep 0.1, 0.3; steps 24, supervision photos; 1 scenes)"
+    )
+    assert cells["pointsplat", 0.3]["made_with"] != cells["pointsplat-own", 0.3]["made_with"]
+    assert all(
+        (cell["point"]["frame_ms_torch"] is None) == (way not in timed)
+        and cell["point"]["fill"] > 0
+        for (way, _), cell in cells.items()
     )
     page = (tmp_path / "tables" / "tables.md").read_text()
-    assert "| 30 % | LightGaussian |" in page and "| 2 steps | 1 |" in page and "| weights " in page
+    assert "| 30 % | LightGaussian |" in page and "| 2 of 5,000 steps | 1 |" in page
+    assert "| weights " in page and "| PointSplat, own photos |" in page
     assert (
         "--refiners" in cells["pointsplat", 0.3]["point"]["command"] and "not measured" not in page
     )
@@ -111,7 +125,7 @@ def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights
     tables = measured(refiners=[other], only=["room/dense/*", "room/p*/*", "room/splat*/*"])
     ways = {way for way, _ in cells_of(tables)}
     assert (
-        not ways & {"pointsplat", "pointsplat-0.1", "paper-splatformer", "splat-transform"}
+        not ways & {"pointsplat", "pointsplat-own", "paper-splatformer", "splat-transform"}
         and "paper" in ways
     )
     said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]
@@ -126,13 +140,13 @@ def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights
     rows = [
         line
         for line in (tmp_path / "tables" / "tables.md").read_text().splitlines()
-        if "| PointSplat |" in line
+        if "| PointSplat, " in line
     ]
     assert rows and all("| not measured | - |" in line for line in rows)
 
 
 TRAIN = (
-    "to train them: ns-train pointsplat --data SCENES --pipeline.model.encoder dual "
+    "to train them: ns-train pointsplat --data OTHER_SCENES --pipeline.model.encoder dual "
     "--pipeline.model.by paper --pipeline.model.keep 0.3 --pipeline.model.opacity-weight 0.3"
 )
 
@@ -143,6 +157,7 @@ TRAIN = (
         ({"keep": 20_000}, TRAIN),
         ({"keep": 0.1, "more_keeps": [0.2]}, TRAIN),
         ({"keep": 0.3, "scenes": ["hall", "room"]}, "were trained on this scene"),
+        ({"keep": 0.3, "scenes": ""}, "do not say which scenes they were trained on"),
     ],
 )
 def test_weights_of_another_budget_or_that_know_the_scene_fill_no_row(
@@ -151,6 +166,52 @@ def test_weights_of_another_budget_or_that_know_the_scene_fill_no_row(
     other = weights("other", {"by": "paper", **trained})
     tables = measured(refiners=[other], only=["room/pointsplat/30%", "room/paper/30%"])
     assert [*cells_of(tables)] == [("paper", 0.3)] and why in tables.missing["room/pointsplat/30%"]
+
+
+@pytest.mark.parametrize(
+    ("trained", "why"),
+    [
+        ({"scenes": "hall"}, "were not trained on this scene"),
+        ({"scenes": "hall, room", "supervision": "dense"}, "were trained on dense targets, not on"),
+        ({"scenes": "hall, room", "supervision": "photos"}, ""),
+    ],
+)
+def test_rows_of_own_photos_take_weights_of_these_photos_alone(measured, weights, trained, why):
+    own = weights("own", {"by": "paper", "keep": 0.3, **trained})
+    tables = measured(refiners=[own], only=["room/pointsplat-own/30%"])
+    assert why in tables.missing.get("room/pointsplat-own/30%", "")
+    assert [*cells_of(tables)] == ([] if why else [("pointsplat-own", 0.3)])
+
+
+def test_of_folders_above_runs_the_newest_of_each_name_counts(weights, tmp_path):
+    file = weights("any", {"by": "paper", "keep": 0.3})
+    for number, folder in enumerate(("a/pointsplat/2", "a/pointsplat/1", "deep/b/pointsplat/run")):
+        target = tmp_path / "outputs" / folder / "refiner.safetensors"
+        target.parent.mkdir(parents=True)
+        target.write_bytes(file.read_bytes())
+        os.utime(target, (number, number))
+    newest = ["a/pointsplat/1", "deep/b/pointsplat/run"]
+    for given in (tmp_path / "outputs", tmp_path):
+        found = [each.path for each in Refiners([given]).all]
+        assert found == [tmp_path / "outputs" / each for each in newest]
+    [one] = Refiners([tmp_path / "outputs" / "a"]).all
+    assert one.path == tmp_path / "outputs" / newest[0]
+    [shipped] = Refiners([Path("shipped")]).all
+    assert shipped.network == WAYS.pointsplat.network and "room35" not in shipped.trained_on
+
+
+def test_fine_tuning_has_the_rounds_and_rates_of_the_publications(measured, monkeypatch):
+    tables = measured(only=["room/pup-tuned/10%", "room/lightgaussian-tuned/10%"], keeps=(0.1,))
+    cells = cells_of(tables)
+    two_rounds = [step for step, _ in cells["pup-tuned", 0.1]["curve"]]
+    assert two_rounds == [0, 1, 2, 2, 3, 4]
+    curve = cells["lightgaussian-tuned", 0.1]["curve"]
+    assert [step for step, _ in curve] == [0, 1, 2] and curve[0][1] != curve[2][1]
+    assert cells["pup-tuned", 0.1]["point"]["gaussians"] == 40
+    late = FINE_TUNING["lightgaussian"].rates(4999, reach=2.0)
+    assert late["opacities"] == pytest.approx(0.05 * 0.95**12)
+    assert late["means"] == pytest.approx(2 * 1.6e-6)
+    assert FINE_TUNING["pup"].rates(4999, reach=2.0)["opacities"] == 0.05
 
 
 def test_an_interrupted_run_goes_on_and_loses_nothing(measured, tmp_path, monkeypatch):
@@ -162,11 +223,11 @@ def test_an_interrupted_run_goes_on_and_loses_nothing(measured, tmp_path, monkey
     figures = Judge.figures
     asked = []
 
-    def interrupted(self, scene):
+    def interrupted(self, scene, timed):
         asked.append(scene)
         if len(asked) == 4:
             raise KeyboardInterrupt
-        return figures(self, scene)
+        return figures(self, scene, timed)
 
     with monkeypatch.context() as patch:
         patch.setattr(Judge, "figures", interrupted)

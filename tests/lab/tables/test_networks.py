@@ -81,7 +81,9 @@ def test_networks_fill_all_rows_and_all_figures(small, room, measured, tmp_path,
     small(seeds=2)
     ps.save(box_room(1, 300), tmp_path / "hall.ply")
     only = [
-        f"*/{way.name}/10*" for way, _ in WAYS.cells((0.1,)) if way.network or way in WAYS.figure_4
+        f"*/{way.name}/10*"
+        for way, _ in WAYS.cells((0.1,))
+        if (way.network and not way.own) or way in WAYS.figure_4
     ]
     tables = measured(tmp_path / "hall.ply", refiners=[trained], only=only, keeps=(0.1,))
     assert tables.missing == {} and len({cell["way"] for cell in tables.cells.values()}) == len(
@@ -107,6 +109,17 @@ def test_networks_fill_all_rows_and_all_figures(small, room, measured, tmp_path,
             refiners=(trained,),
         )
         assert target.read_bytes().startswith(b"\x89PNG") and target.stat().st_size > 10_000
+
+
+def test_networks_of_own_photos_are_trained_on_photos():
+    both = [jobs(own=own) for own in (False, True)]
+    assert len(both[0]) == len(both[1]) == 16
+    assert {f"{job.name.rpartition('-')[0]}-own" for job in both[0]} == {
+        job.name.rpartition("-")[0] for job in both[1]
+    }
+    assert both[1][0].way.network is not None
+    options = both[1][0].way.network.options(0.1, own=True)
+    assert options["pipeline.datamanager.supervision"] == "photos"
 
 
 def test_a_figure_without_its_network_names_the_command_that_trains_it(room, tmp_path):
