@@ -18,6 +18,7 @@ from statistics import fmean
 import tyro
 
 from lab.common.printing import markdown, number, put_between, start
+from lab.common.results import Row
 from lab.judge import refiners
 from lab.judge.record import FOLDER, ROOT
 from lab.tables import sources
@@ -25,7 +26,7 @@ from lab.tables.cells import Tables
 from lab.tables.curves import TUNED, last_gain, mean_curve, plot_curves
 from lab.tables.figure import plot_figure
 from lab.tables.findings import CLAIMS, OURS, paragraph
-from lab.tables.layout import Layout, Table, escaped, markdown_table
+from lab.tables.layout import HEADS, WRITTEN, Layout, Table, escaped, markdown_table
 from lab.tables.replica_row import section
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.system.files import replacing
@@ -39,6 +40,9 @@ LEFT_OUT = ("PSNR (renders)", "SSIM (renders)", "spread", "loses most", "scenes"
 FIGURE = "results_figure4.png"
 
 CURVES = "results_curves.png"
+
+EXAMPLE = "room35"
+"""The scene whose cells the page shows how to measure again."""
 
 ENCODERS_FILE = "encoders.json"
 
@@ -62,7 +66,7 @@ that spread.
 `lab/judge/tables_record.py` writes this page from [results.json](results.json), which
 [`python -m lab.tables`](../tables.md) measured on [captures](../benchmarks.md#scenes) that no constant was chosen on.
 In a clone, with its kernels built (`python setup.py build_ext --inplace`), this makes a dense scene and measures one
-row of each table; other rows are named in the same way:
+cell of each table, those below. Other cells are named in the same way; `results.json` has all:
 
 ```bash
 python -m lab.judge.captures room35 clone captures/room35
@@ -70,6 +74,10 @@ ns-train splatfacto-cpu --output-dir outputs --experiment-name room35 --max-num-
     nerfstudio-data --eval-mode interval --eval-interval 8
 {commands}
 ```
+
+{examples}
+
+The scenes:
 
 {scenes}
 
@@ -144,17 +152,32 @@ def shortened(table: Table) -> Table:
     return dataclasses.replace(table, header=tuple(header), rows=lines, notes=notes)
 
 
-def commands(tables: Tables, names: list[str]) -> str:
-    """Commands that measure one row of each table again, from those of its cells."""
-    one_each = ((WAYS.lightgaussian, 0.1), (WAYS.merge, 0.1), (WAYS.paper, 0.1))
+def repeated(tables: Tables, names: list[str]) -> list[Row]:
+    """A cell of one scene for a row of each table: Table 1 has the first, Tables 1 and 2 the
+    second, Tables 3 and 4 the third."""
     found = []
-    for way, share in one_each:
-        keys = (cell_key(name, way, share) for name in sorted(names, key=lambda n: n != "room35"))
-        cell = next((tables.cells[key] for key in keys if key in tables.cells), None)
-        if cell is not None:
-            words = textwrap.wrap(cell["point"]["command"], 114, break_on_hyphens=False)
-            found.append(" \\\n    ".join(words))
-    return "\n".join(found)
+    first = sorted(names, key=lambda name: name != EXAMPLE)
+    for way in (WAYS.lightgaussian, WAYS.merge, WAYS.paper):
+        keys = (cell_key(name, way, PROTOCOL.ablation_share) for name in first)
+        found += [tables.cells[key] for key in keys if key in tables.cells][:1]
+    return found
+
+
+def commands(cells: list[Row]) -> str:
+    """The commands of cells, in short lines."""
+    lines = (textwrap.wrap(cell["point"]["command"], 114, break_on_hyphens=False) for cell in cells)
+    return "\n".join(" \\\n    ".join(words) for words in lines)
+
+
+def figures_of(cells: list[Row]) -> str:
+    """A table of what these cells were measured to be."""
+    lines = []
+    for cell in cells:
+        point = cell["point"]
+        found = point["against_photos"] or point["against_dense"]
+        shown = [write(found.get(name)) for name, write in WRITTEN.items()]
+        lines.append([escaped(point["key"]), f"{point['gaussians']:,}", *shown])
+    return markdown(["cell", "Gaussians", *HEADS.values()], lines)
 
 
 def not_measured(tables: Tables) -> str:
@@ -234,6 +257,7 @@ def page(tables: Tables, record: Path) -> str:
         ]
         for about in abouts
     ]
+    examples = repeated(tables, main_names)
     text = PAGE.format(
         count=len(main_names),
         finding=_wrapped(f"**Finding.** {escaped(paragraph(CLAIMS, tables.cells, main_names))}"),
@@ -241,7 +265,8 @@ def page(tables: Tables, record: Path) -> str:
             "**Merging and compact**, of this package. "
             f"{escaped(paragraph(OURS, tables.cells, main_names))}"
         ),
-        commands=commands(tables, main_names),
+        commands=commands(examples),
+        examples=figures_of(examples),
         scenes=markdown(heads, [list(map(escaped, line)) for line in scenes]),
         machines="\n  and ".join(sorted({about["machine"] for about in abouts})),
     )

@@ -17,12 +17,11 @@ from lab.common.printing import percent, save_figure, start
 from lab.tables.cells import Tables
 from lab.tables.figure import plot_figure
 from lab.tables.make_scene import Maker, Refiners, Tools
-from lab.tables.scenes import Options, open_scene
+from lab.tables.scenes import Options, open_scene, scenes_at
 from lab.tables.ways import PROTOCOL, WAYS
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.scene.runs import name_of
 
 FEW = PROTOCOL.ablation_share
 HALF = PROTOCOL.figure_share
@@ -73,9 +72,9 @@ def main(
         return plot_figure(tables.cells, tables.groups(), output)
     tools = Tools(Options(views, side, fine_tune=300), Refiners(refiners))
     rows = []
-    for path in scenes:
+    for name, path in (pair for given in scenes for pair in scenes_at(given).items()):
         scene = open_scene(path, data, tools.options)
-        maker = Maker(scene, name_of(path), tools)
+        maker = Maker(scene, name, tools)
         look = scene.held_out.views[view]
         made = {}
         for way, share in COLUMNS[number]:

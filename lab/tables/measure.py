@@ -25,7 +25,14 @@ from lab.tables.figure import distributions
 from lab.tables.fine_tune import PUBLISHED_STEPS
 from lab.tables.layout import write_tables
 from lab.tables.make_scene import Maker, Refiners, Tools
-from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
+from lab.tables.scenes import (
+    OpenedScene,
+    Options,
+    open_scene,
+    paper_dataset,
+    run_or_file,
+    scenes_at,
+)
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.metrics import MOST_PSNR
@@ -36,7 +43,7 @@ from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.rendering.comparison.fill import fill
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import source_file
-from pointsplat_ns.scene.runs import may_be_run, name_of, open_run
+from pointsplat_ns.scene.runs import may_be_run, open_run
 from pointsplat_ns.scene.views import View, Views
 from pointsplat_ns.system.files import logger, need_folder
 from pointsplat_ns.system.progress import tracked
@@ -161,7 +168,7 @@ def measured(
     judged = time.perf_counter() - start
     key = cell_key(name, way, share)
     size = ply_bytes(len(small), small.sh_degree)
-    words = [str(scene.path), "-o", str(output), "--only", key, *tools.words(way, share, name)]
+    words = [str(scene.given), "-o", str(output), "--only", key, *tools.words(way, share, name)]
     point = {
         "key": key,
         "label": way.label,
@@ -222,8 +229,8 @@ def measure_tables(
     earlier commands.
 
     Args:
-        scenes: Splatfacto runs (folders or config.yml), whose held-out photos are then used where
-            they are found; or files of scenes.
+        scenes: Splatfacto runs (folders, folders above them, or config.yml), whose held-out photos
+            are then used where they are found; or files of scenes.
         output: folder for tables.json with all cells, tables.md and figure4.png.
         keeps: shares of the Gaussians in Tables 1 and 2.
         refiners: weights for the rows with a network: .safetensors files, runs, folders above runs
@@ -254,8 +261,9 @@ def measure_tables(
         )
     if not scenes:
         raise PointSplatError("no scene is named; expected Splatfacto runs, or files of scenes")
-    paths = {name_of(Path(path)): Path(path) for path in scenes}
-    if len(paths) < len(scenes):
+    named = [pair for path in scenes for pair in scenes_at(Path(path)).items()]
+    paths = dict(named)
+    if len(paths) < len(named):
         raise PointSplatError(
             "two scenes have one name; expected different ones, found "
             f"{', '.join(map(str, scenes))}"
@@ -264,7 +272,7 @@ def measure_tables(
     need_folder(output)
     tables = Tables.read(output, force)
     for name, path in paths.items():
-        tables.enter(name, _about(path, data, options), _groups(groups, paths).get(name))
+        tables.enter(name, _about(name, path, data, options), _groups(groups, paths).get(name))
     tables.missing = {}
     networks = networks_at_hand(lpips)
     wanted = _wanted(tables, paths, keeps, tools, only, networks)
@@ -326,19 +334,20 @@ def _measure(
         )
 
 
-def _about(path: Path, data: Path | None, options: Options) -> Row:
+def _about(name: str, path: Path, data: Path | None, options: Options) -> Row:
     """Facts on a scene, of which nothing is read but the hash of its file and, of a run, its
     settings."""
     dataset = ""
-    if may_be_run(path):
+    run = run_or_file(path)
+    if may_be_run(run):
         try:
-            dataset = paper_dataset(open_run(path, data=data))
+            dataset = paper_dataset(open_run(run, data=data))
         except SceneError:  # its data is gone
             pass
     machine = machine_text(torch.device("cpu"))
-    about: Row = {"name": name_of(path), "path": str(path), "dataset": dataset, "machine": machine}
+    about: Row = {"name": name, "path": str(path), "dataset": dataset, "machine": machine}
     asked = {name: value for name, value in asdict(options).items() if name != "fine_tune"}
-    return about | {"of": {"file": source_file(path).sha256, "machine": machine, **asked}}
+    return about | {"of": {"file": source_file(run).sha256, "machine": machine, **asked}}
 
 
 def _groups(groups: Sequence[str], names: dict[str, Path]) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,9 +17,17 @@ from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.pruning import need_usable
+from pointsplat_ns.scene.discovery import find_runs
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene
-from pointsplat_ns.scene.runs import Run, may_be_run, open_run
+from pointsplat_ns.scene.runs import (
+    RUN_FILES,
+    Run,
+    may_be_run,
+    name_of,
+    open_run,
+    scene_name,
+)
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.files import logger
 
@@ -88,7 +97,10 @@ class Pictures:
 class OpenedScene:
     """The data of a scene."""
 
+    given: Path
+    """The path as it was named, such as the folder of an experiment."""
     path: Path
+    """The run, or the file."""
     data: Path | None
     """Folder of its photos, if it is no longer where the run says."""
     dense: Gaussians
@@ -102,9 +114,28 @@ class OpenedScene:
     """Differences from the paper's protocol."""
 
 
-def open_scene(path: Path, data: Path | None, options: Options) -> OpenedScene:
+def scenes_at(path: Path) -> dict[str, Path]:
+    """Names and paths of the scenes at a path: a run, a file, or a folder above runs, of which the
+    newest of each experiment count. A folder of one experiment keeps its path."""
+    if path.is_dir() and not (path / RUN_FILES.config).is_file():
+        with suppress(SceneError):  # no run below it: a folder that is a scene, or none
+            runs = find_runs(path)
+            return {scene_name(run): path if len(runs) == 1 else run.folder for run in runs}
+    return {name_of(path): path}
+
+
+def run_or_file(path: Path) -> Path:
+    """The newest run at or below a path of :func:`scenes_at`, or the path."""
+    if path.is_dir() and not (path / RUN_FILES.config).is_file():
+        with suppress(SceneError):
+            return find_runs(path)[0].folder
+    return path
+
+
+def open_scene(given: Path, data: Path | None, options: Options) -> OpenedScene:
     """Read a scene, its views, and its photos if there are any. Raises SceneError if no Gaussian
     can be drawn."""
+    path = run_or_file(given)
     dense = read_scene(path)
     need_usable(dense)
     if may_be_run(path):
@@ -116,7 +147,8 @@ def open_scene(path: Path, data: Path | None, options: Options) -> OpenedScene:
             differs = differences(
                 open_run(path, data=data), dense.sh_degree, len(held_out.views), size
             )
-            return OpenedScene(path, data, dense, held_out, training, "held-out photos", differs)
+            origin = "held-out photos"
+            return OpenedScene(given, path, data, dense, held_out, training, origin, differs)
         except (SceneError, DataError) as error:
             logger.warning("%s: no photos to compare with: %s", path, error)
     judging, training_views = SAMPLED
@@ -124,7 +156,7 @@ def open_scene(path: Path, data: Path | None, options: Options) -> OpenedScene:
     held_out = Pictures(views).resized(options.side)
     training = Pictures(ps.sample_views(dense, training_views)).resized(options.side)
     return OpenedScene(
-        path, data, dense, held_out, training, "sampled views", ("no held-out photos",)
+        given, path, data, dense, held_out, training, "sampled views", ("no held-out photos",)
     )
 
 

@@ -106,6 +106,18 @@ def test_the_page_names_what_was_not_measured_with_a_command():
     )
 
 
+def test_the_page_shows_how_to_measure_a_cell_of_each_table_and_what_it_is():
+    tables = tables_record.read(tables_record.FOLDER / "results.json")
+    page = (tables_record.FOLDER / "results.md").read_text("utf-8")
+    cells = tables_record.repeated(tables, list(tables.scenes))
+    assert [cell["way"] for cell in cells] == ["lightgaussian", "merge", "paper"]
+    for cell in cells:
+        point = cell["point"]
+        assert f"--only {point['key']}" in " ".join(page.replace("\\\n", " ").split())
+        psnr = point["against_photos"]["psnr"]
+        assert f"| {point['key']} | {point['gaussians']:,} | {psnr:.2f} |" in page
+
+
 def test_the_record_has_merge_and_compact_in_tables_1_and_2():
     page = (tables_record.FOLDER / "results.md").read_text("utf-8")
     tables = page.partition("## Tables")[2]

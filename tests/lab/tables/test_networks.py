@@ -8,7 +8,9 @@ import torch
 
 import pointsplat_ns as ps
 from lab.tables import figures, networks
+from lab.tables.measure import measure_tables
 from lab.tables.networks import jobs
+from lab.tables.scenes import run_or_file, scenes_at
 from lab.tables.ways import WAYS
 from making import box_room, write_run
 from pointsplat_ns.errors import PointSplatError
@@ -110,6 +112,30 @@ def test_networks_fill_all_rows_and_all_figures(small, room, measured, tmp_path,
             refiners=(trained,),
         )
         assert target.read_bytes().startswith(b"\x89PNG") and target.stat().st_size > 10_000
+
+
+def test_a_folder_above_runs_is_measured_in_its_photos_under_its_own_path(
+    trained_walls, tmp_path, no_lpips
+):
+    assert [*scenes_at(trained_walls)] == ["wall-a", "wall-b"]
+    wall = trained_walls / "wall-a"
+    assert scenes_at(wall) == {"wall-a": wall}
+    assert (run_or_file(wall) / "config.yml").is_file()
+    only = ["wall-a/dense/*", "wall-a/lightgaussian*/30%"]
+    tables = measure_tables((wall,), tmp_path / "tables", keeps=(0.3,), only=only, fine_tune=4)
+    cells = {key.split("/")[1]: cell for key, cell in tables.cells.items()}
+    assert [*cells] == ["dense", "lightgaussian", "lightgaussian-tuned"]
+    tuned = cells["lightgaussian-tuned"]
+    assert f"lab.tables {wall} -o" in tuned["point"]["command"]
+    assert "--fine-tune 4" in tuned["point"]["command"]
+    psnr = {way: cell["point"]["against_photos"]["psnr"] for way, cell in cells.items()}
+    steps, curve = zip(*tuned["curve"], strict=True)
+    assert steps == (0, 1, 2, 4)
+    assert curve[0] == pytest.approx(psnr["lightgaussian"], abs=1e-4)
+    assert curve[-1] == pytest.approx(psnr["lightgaussian-tuned"], abs=1e-4)
+    about = tables.scenes["wall-a"]
+    assert about["views"] == 2 and "held-out photos" not in about["differs"]
+    assert "30 of 15,000 Splatfacto steps" in about["differs"]
 
 
 def test_networks_of_own_photos_are_trained_on_photos():
