@@ -15,7 +15,7 @@ from pointsplat_ns.pipeline.report import Report
 from pointsplat_ns.pipeline.subject import Source, read_subject
 from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner
 from pointsplat_ns.pruning import Keep
-from pointsplat_ns.scene.formats import format_to_write
+from pointsplat_ns.scene.formats import SPZ_VERSION
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene, source_file
 from pointsplat_ns.scene.views import Views
@@ -67,6 +67,7 @@ def prune(
     photos: bool | str | Path = False,
     memory: float | str | None = None,
     jobs: int | None = None,
+    spz_version: int = SPZ_VERSION,
     progress: bool | Progress = False,
 ) -> Gaussians:
     """Make a scene smaller: merge neighbours, or keep the most important Gaussians. Needs no
@@ -104,6 +105,7 @@ def prune(
         memory: memory limit, such as "8GB" or 8000 (units of 10^6 bytes); by default the free
             memory. A PLY that needs more is merged in parts.
         jobs: number of processes that share these parts, each within ``memory``.
+        spz_version: version of SPZ to which the size of an .spz refers, as for :func:`save`.
         progress: True shows a bar; a function is called with the current task and the share of it
             that is done.
 
@@ -134,6 +136,7 @@ def prune(
         resolution=resolution,
         up=up,
         data=data,
+        spz_version=spz_version,  # type: ignore[arg-type]
     )
     done = run.prune(
         scene,
@@ -160,6 +163,7 @@ def compact(
     photos: bool | str | Path = False,
     target_db: float | None = None,
     target_format: str = ".ply",
+    spz_version: int = SPZ_VERSION,
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
@@ -190,6 +194,7 @@ def compact(
         target_db: minimum PSNR of the final file against renders of the given scene, over the
             pixels that it covers, dB, in place of ``keep``. The smallest such file is searched for.
         target_format: format for a file size or PSNR: ".ply", ".spz", ".sog", ...
+        spz_version: version of that .spz, as for :func:`save`.
         views: cameras for comparison, as for :func:`prune`; at most 12 are used. The repair uses
             the others, and samples views if there are too few.
         resolution, up, data, progress: as for :func:`prune`.
@@ -211,13 +216,13 @@ def compact(
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
-    format_to_write(target_format)
     options = CompactOptions(
         keep=keep,
         by=by or "",
         sh=sh,  # type: ignore[arg-type]
         clean=clean,
         target_format=target_format,
+        spz_version=spz_version,  # type: ignore[arg-type]
         effort=effort,
         seconds=seconds,
         photos=photos,
@@ -316,6 +321,7 @@ def lod(
     stream: bool = False,
     tiles: bool = False,
     at: str | None = None,
+    spz_version: int | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Levels:
@@ -340,6 +346,8 @@ def lod(
         at: place of the tiles on the Earth: UTM zone of the scene's coordinates ("EPSG:32632"), or
             latitude, longitude and height of its origin ("48.86,2.29,35"); by default tiles keep
             the frame of the scene's file.
+        spz_version: version of the SPZ in tiles: 3, the newest that CesiumJS reads, or 2; by
+            default 3.
         force: overwrite existing files in ``folder``.
 
     Returns:
@@ -363,7 +371,7 @@ def lod(
     reduction = PruneOptions(keep=1.0, sh=sh)  # type: ignore[arg-type]
     reduction.check()
     repair = RepairBudget(effort)
-    output = LevelOutput.of(folder, stream, tiles, at, up, force)
+    output = LevelOutput.of(folder, stream, tiles, at, up, force, spz_version)
     if output is not None:
         output.check(len(budgets))
     options = ViewOptions(poses=_named(views), resolution=resolution, up=up, data=data)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, print_result, scene_result
-from pointsplat_ns.pipeline.options import ViewOptions
+from pointsplat_ns.pipeline.options import SpzVersion, ViewOptions
 from pointsplat_ns.system.terminal import say
 
 
@@ -16,6 +16,7 @@ def clean(
     output: options.Output = None,
     strength: float = 0.5,
     picture: Path | None = None,
+    spz_version: SpzVersion = 4,
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
@@ -29,6 +30,7 @@ def clean(
             cannot be drawn or seen.
         picture: .png file with three views of the scene, the removed Gaussians with a colour per
             cluster, and the result; by default none.
+        spz_version: version of an .spz, as for convert.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -45,7 +47,7 @@ def clean(
     if picture is not None:
         plot_cleaning(done, picture)
     log_lines(cleaning_lines(done.cleaning))
-    ps.save(done.scene, output, progress=True, overwrite=True)
+    ps.save(done.scene, output, True, overwrite=True, spz_version=spz_version)
     quality = quality_of_file(judge_of(done.dense, done.views), done.scene, output)
     before = len(done.dense)
     if json_output:

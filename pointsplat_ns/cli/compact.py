@@ -19,7 +19,7 @@ from pointsplat_ns.cli.printing import (
     scene_result,
     written_size,
 )
-from pointsplat_ns.pipeline.options import CompactOptions
+from pointsplat_ns.pipeline.options import CompactOptions, SpzVersion
 from pointsplat_ns.system.terminal import say
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ class Goal(NamedTuple):
     """Maximum size of the page, 10^6 bytes."""
     use: str = "to fly through in a browser"
     """Text on the use of the page."""
+    spz_version: SpzVersion | None = None
+    """Version of an .spz; None for the default."""
 
 
 GOALS: dict[GoalName | None, Goal] = {
@@ -56,7 +58,7 @@ GOALS: dict[GoalName | None, Goal] = {
         "allowfullscreen></iframe>",
     ),
     "phone": Goal(".sog", "500000gaussians"),
-    "headset": Goal(".spz", "400000gaussians"),
+    "headset": Goal(".spz", "400000gaussians", spz_version=3),
     "email": Goal(".spz", "5MB", True, 10.0, "to fly through after a double click, also offline"),
 }
 """Sources of the figures: docs/guides/downloaded_splat.md."""
@@ -91,9 +93,9 @@ def compact(
             of scenes, another folder; by default rooms_compact beside rooms, with results in the
             formats of their scenes.
         goal: purpose, in place of --keep and a format: web (a .sog of 2 MB, and a page to embed in
-            a web site), phone (a .sog of at most 500,000 Gaussians), headset (an .spz of at most
-            400,000), email (an .spz of 5 MB, and a page that opens with a double click). --keep,
-            --target-db and --html override its parts.
+            a web site), phone (a .sog of at most 500,000 Gaussians), headset (an .spz of version 3
+            of at most 400,000), email (an .spz of 5 MB, and a page that opens with a double click).
+            --keep, --target-db, --spz-version and --html override its parts.
         picture: .png file with some views of the dense scene and of the scene before and after the
             repair, side by side; for a folder, all scenes before and after; by default none.
         html: .html file to fly through the scene before and after, offline in a browser, with a
@@ -110,6 +112,8 @@ def compact(
     )
     if how.keep is None and how.target_db is None:
         how = replace(how, keep=purpose.keep)
+    if how.spz_version is None:
+        how = replace(how, spz_version=purpose.spz_version)
     if is_folder_of_scenes(scene):
         return _compact_folder(scene, how, output, purpose, picture, html, force, jobs, json_output)
     if jobs is not None:
@@ -137,7 +141,7 @@ def compact(
     done = run.compact(scene, how, refiner, state_file=state_file, progress=True)
     log_report(done.report)
     report = done.report
-    ps.save(report.scene, output, progress=True, overwrite=True)
+    ps.save(report.scene, output, True, overwrite=True, spz_version=how.spz)
     remove_own(state_file)
     quality = quality_of_file(done.judge, report.scene, output)
     if quality is not None:
@@ -199,6 +203,7 @@ def _compact_folder(
         resolution=how.resolution,
         data=how.data,
         target_format=purpose.suffix,
+        spz_version=how.spz,
         html=html,
         picture=picture,
         jobs=1 if jobs is None else jobs,
@@ -278,8 +283,11 @@ def _print_folder(
     failed."""
     from pointsplat_ns.errors import PointSplatError
     from pointsplat_ns.scene.discovery import FOLDER_FILES
+    from pointsplat_ns.scene.formats.spz import version_of
     from pointsplat_ns.system.terminal import print_table
+    from pointsplat_ns.tools.wording import spz_readers
 
+    done = [result.output for result in results if result.status in ("done", "done before")]
     failed = sum(result.status == "failed" for result in results)
     if json_output:
         print_json({"output": folder, "scenes": [asdict(result) for result in results]})
@@ -301,6 +309,9 @@ def _print_folder(
             f"{folder}: {len(results) - failed} of {len(results)} scenes, and the table "
             f"{FOLDER_FILES.scenes_table}"
         )
+        spz = [file for file in map(Path, done) if file.suffix == ".spz"]
+        if spz:
+            say(spz_readers(version_of(spz[0])))
         for path in shown:
             say(f"{path}: all scenes before and after")
     if failed:

@@ -9,7 +9,8 @@ from typing import Literal
 import tyro
 
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.printing import print_json, scene_result, written_size
+from pointsplat_ns.cli.printing import print_json, print_readers, scene_result, written_size
+from pointsplat_ns.pipeline.options import SpzVersion
 from pointsplat_ns.system.quantities import seconds_text
 from pointsplat_ns.system.terminal import say
 
@@ -21,6 +22,7 @@ def convert(
     up: str | None = None,
     scale: float = 1.0,
     original_frame: bool = False,
+    spz_version: SpzVersion = 4,
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
@@ -39,6 +41,8 @@ def convert(
         scale: factor on positions and sizes.
         original_frame: undo nerfstudio's rotation, translation and scale of the data of a
             Splatfacto run.
+        spz_version: version of an .spz: 4, which the format's own library, SuperSplat, PlayCanvas
+            and three.js read; 3 for Spark 2.2 and older viewers; or 2 for viewers from before 2025.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -51,7 +55,7 @@ def convert(
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))
     after = ps.place(after, up, scale, scene if original_frame else None)
-    ps.save(after, output, progress=True, overwrite=True)
+    ps.save(after, output, True, overwrite=True, spz_version=spz_version)
     seconds = time.perf_counter() - start
     if json_output:
         print_json(scene_result(len(before), after, seconds, output))
@@ -63,3 +67,4 @@ def convert(
         f"{output}: {len(after):,} Gaussians, {degree}, {written_size(output)}, in "
         f"{seconds_text(seconds)}{made}"
     )
+    print_readers(output)

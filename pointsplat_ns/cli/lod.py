@@ -24,6 +24,7 @@ def lod(
     stream: bool = False,
     tiles: bool = False,
     at: str | None = None,
+    spz_version: Literal[3, 2] | None = None,
     sh: Bands = "all",
     effort: Literal["instant", "quick", "thorough"] = "instant",
     force: options.Force = False,
@@ -54,6 +55,8 @@ def lod(
             latitude, longitude and height of its origin in degrees and metres (48.86,2.29,35;
             --at=-33.9,... in the south), with up rotated to the zenith. By default tiles keep the
             frame of the scene's file.
+        spz_version: version of the SPZ in --tiles: 3, the newest that CesiumJS reads, or 2; by
+            default 3.
         sh: SH bands of every level: all, a maximum degree, or auto, the lowest degree whose renders
             reach 40 dB.
         effort: length of the repair of each level, as for compact: none (instant), quick, or
@@ -63,6 +66,7 @@ def lod(
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.scene.discovery import FOLDER_FILES
+    from pointsplat_ns.scene.formats.glb_tile import TILE_SPZ_VERSION
 
     options.need_one_scene(scene)
     options.check_poses(view_options.poses)
@@ -83,6 +87,7 @@ def lod(
         stream=stream,
         tiles=tiles,
         at=at,
+        spz_version=spz_version,
         force=force,
         progress=True,
     )
@@ -93,16 +98,17 @@ def lod(
             {"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))}
         )
     else:
-        _print_table(made, folder)
+        _print_table(made, folder, (spz_version or TILE_SPZ_VERSION) if tiles else None)
     if made.interrupted:
         raise KeyboardInterrupt  # once the levels are written and printed
 
 
-def _print_table(made: Levels, folder: Path) -> None:
+def _print_table(made: Levels, folder: Path, spz_version: int | None) -> None:
+    """Print the levels, and the version of the SPZ in tiles; None for no tiles."""
     from pointsplat_ns.pruning import ply_bytes
     from pointsplat_ns.scene.discovery import FOLDER_FILES
     from pointsplat_ns.system.files import bytes_text, three_digits
-    from pointsplat_ns.tools.wording import impression
+    from pointsplat_ns.tools.wording import impression, spz_tiles
 
     apart = (folder / FOLDER_FILES.levels).exists()  # every level has its own PLY
     rows = []
@@ -125,5 +131,7 @@ def _print_table(made: Levels, folder: Path) -> None:
     files = [path for path in (folder, *folder.rglob("*")) if path.is_file()]
     size = bytes_text(sum(path.stat().st_size for path in files))
     say(f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all")
+    if spz_version is not None:
+        say(spz_tiles(spz_version))
     header = ("", "Gaussians", "share", "MB", "seconds", "dB", "SSIM", "")
     print_table(header, rows, "dB: PSNR against the dense scene", left=(0, 7))

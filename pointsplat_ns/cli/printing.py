@@ -48,12 +48,14 @@ def scene_result(
 ) -> dict[str, Any]:
     """JSON values of a result. ``before`` is the count of the dense scene; None if there is
     none."""
+    version = _spz_version(where)
     return {
         "output": where,
         **({} if before is None else {"gaussians_before": before}),
         "gaussians": len(scene),
         "sh_degree": scene.sh_degree,
         "bytes": where.stat().st_size,
+        **({} if version is None else {"spz_version": version}),
         "seconds": seconds,
     }
 
@@ -82,6 +84,7 @@ def print_result(
         verb = {"merge": "merged", "clean": "removed"}.get(by, "pruned")
         summary = f"nothing is {verb}, all {before:,} Gaussians remain"
     say(f"{where}: {summary}, {written_size(where)}, in {seconds_text(seconds)}")
+    print_readers(where)
     if quality is not None:
         say(quality_text(quality))
         say(fill_text(quality))
@@ -89,6 +92,23 @@ def print_result(
         say("not compared with the dense scene: it does not fit into memory")
     else:
         say("not compared with the dense scene: nothing of it is visible")
+
+
+def print_readers(where: Path) -> None:
+    """Print the version of an SPZ file, and the programs that read it. Other files print
+    nothing."""
+    from pointsplat_ns.tools.wording import spz_readers
+
+    version = _spz_version(where)
+    if version is not None:
+        say(spz_readers(version))
+
+
+def _spz_version(where: Path) -> int | None:
+    """Version of a written SPZ file; None for other formats."""
+    from pointsplat_ns.scene.formats.spz import version_of
+
+    return version_of(where) if where.suffix.lower() == ".spz" else None
 
 
 def print_if_larger(scene: Path, where: Path) -> None:

@@ -23,7 +23,6 @@ from pointsplat_ns.pipeline.report import Report, StageResult, TargetSearch, las
 from pointsplat_ns.pipeline.stages import Context, Refine, Repair, TrainOnPhotos, rounded
 from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner
 from pointsplat_ns.pipeline.view_provider import ViewProvider
-from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.formats.rounding import ROUNDING, rounding_for
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.progress import Progress, silent, within
@@ -169,10 +168,9 @@ def compact_to_quality(
         DataError: if there are no views, or no held-out photos to judge by.
     """
     start = time.perf_counter()
-    suffix = options.target_format
     numbers = itertools.count(1)
     judge = Judge(dense, views)
-    kind = format_to_write(suffix)
+    kind = options.format_of(options.target_format)
     device = default_device() if refiner is None else refiner.device
     photo_indices = [*range(len(held_out))]
     dense_psnr = 0.0
@@ -196,7 +194,7 @@ def compact_to_quality(
             result = rounded(candidate.last, limit, candidate.reference)
             if result is not candidate.last:
                 candidate = replace(candidate, stages=(*candidate.stages, result))
-        written_bytes, written = through_file(candidate.scene, suffix)
+        written_bytes, written = through_file(candidate.scene, kind)
         if options.most_lost is None:
             psnr, _ = judge.psnr(written)
         else:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from pointsplat_ns.pipeline.trained_refiner import TrainedRefiner
     from pointsplat_ns.pruning import Keep, Method
+    from pointsplat_ns.scene.formats import Format
     from pointsplat_ns.scene.gaussians import Gaussians, Traits
     from pointsplat_ns.view_sampling.upright import Up
 
@@ -35,6 +36,10 @@ AUTO_PHOTO_LOSS = 0.3
 """Maximum loss of PSNR in held-out photos with ``--photos --keep auto``, dB."""
 
 Bands = Literal["all", "auto", "0", "1", "2", "3"]
+
+
+SpzVersion = Literal[4, 3, 2]
+"""Versions of SPZ that are written."""
 
 
 def default_device() -> torch.device:
@@ -173,6 +178,10 @@ class ReductionOptions:
     clean: bool = False
     """First remove Gaussians that cannot be drawn or seen; --keep still refers to the whole
     scene."""
+    spz_version: SpzVersion | None = None
+    """Version of an .spz result; by default 4, which the format's own library, SuperSplat,
+    PlayCanvas and three.js read. Spark 2.2 and older viewers need 3, viewers from before 2025 need
+    2. A size in --keep is that of this version."""
     target_format: Suppress[str] = ".ply"
     """Suffix of the format of the result. A size or PSNR in ``keep`` without a format refers to
     it."""
@@ -194,9 +203,23 @@ class ReductionOptions:
 
         return method_named(self.by, self.opacity_weight)
 
+    @property
+    def spz(self) -> int:
+        """Version of an .spz result."""
+        from pointsplat_ns.scene.formats import SPZ_VERSION
+
+        return SPZ_VERSION if self.spz_version is None else self.spz_version
+
+    def format_of(self, suffix: str) -> Format:
+        """The format of a result with a suffix, SPZ in the version of the options. Raises
+        SceneError or PointSplatError if there is none."""
+        from pointsplat_ns.scene.formats import format_to_write
+
+        return format_to_write(suffix, self.spz)
+
     def check(self) -> None:
         """Raise a PointSplatError if an option is invalid, or contradicts another."""
-        _ = self.method, self.budget
+        _ = self.method, self.budget, self.format_of(self.target_format)
         if self.sh not in ("all", "auto", "0", "1", "2", "3"):
             raise PointSplatError(f"sh is {self.sh!r}; expected all, auto or a degree from 0 to 3")
 

@@ -35,7 +35,7 @@ from pointsplat_ns.pruning import (
 )
 from pointsplat_ns.pruning.merging import Merger, merge
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
-from pointsplat_ns.scene.formats import format_to_write
+from pointsplat_ns.scene.formats import Format
 from pointsplat_ns.scene.formats.rounding import rounding_for
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.progress import Progress, silent
@@ -103,10 +103,12 @@ def prune_scene(
         searching = functools.partial(progress, "trying counts")
         budget = options.budget
         if isinstance(budget, Megabytes):
-            scene, limit, search = _for_size(dense, start, make, budget, views, searching)
+            target = FileLimit(options.format_of(budget.suffix), budget.bytes)
+            scene, limit, search = _for_size(dense, start, make, target, views, searching)
         else:
             assert isinstance(budget, WithinPsnr)
-            scene, limit, search = _for_psnr(dense, make, budget, views, searching)
+            kind = options.format_of(budget.suffix)
+            scene, limit, search = _for_psnr(dense, make, budget.value, kind, views, searching)
     if limit is not None and rounding:
         scene = limit.rounded(scene)
     return Pruned(scene=scene, sh=sh_cut, cleaning=cleaning, search=search, limit=limit)
@@ -141,32 +143,32 @@ def _with_sh(
 def _for_psnr(
     dense: Gaussians,
     make: Callable[[int], Gaussians],
-    budget: WithinPsnr,
+    wanted: float,
+    kind: Format,
     views: ViewProvider,
     progress: Callable[[float], None],
 ) -> tuple[Gaussians, FileLimit | None, PsnrSearch]:
-    """The smallest scene that reaches a PSNR against ``dense``, the limit of its file, and the
-    search.
+    """The smallest scene that reaches the ``wanted`` PSNR against ``dense``, dB, the limit of its
+    file, and the search.
 
     For a format that rounds, the rounded scene reaches the PSNR; for others the limit is None.
     ``make(n)`` returns n Gaussians."""
     judge = Judge(dense, views)
-    kind = format_to_write(budget.suffix)
     limit = (
         None
         if kind.rounded is None
-        else FileLimit(kind, math.inf, rounding_for(budget.value, dense.sh_degree))
+        else FileLimit(kind, math.inf, rounding_for(wanted, dense.sh_degree))
     )
     numbers = itertools.count()
 
     def measure(count: int) -> tuple[float, tuple[Gaussians, float, float]]:
         scene = make(count)
         before = next(numbers)
-        _, written = through_file(scene if limit is None else limit.rounded(scene), budget.suffix)
+        _, written = through_file(scene if limit is None else limit.rounded(scene), kind)
         psnr, worst = judge.psnr(written, lambda share: progress(share_done(before + share)))
         return psnr, (scene, psnr, worst)
 
-    (scene, psnr, worst), found = smallest_within(len(dense), measure, budget.value)
+    (scene, psnr, worst), found = smallest_within(len(dense), measure, wanted)
     search = PsnrSearch(tried=len(found.tried), psnr=psnr, worst=worst, views=len(judge.views))
     return scene, limit, search
 
@@ -175,13 +177,13 @@ def _for_size(
     dense: Gaussians,
     start: Gaussians,
     make: Callable[[int], Gaussians],
-    budget: Megabytes,
+    limit: FileLimit,
     views: ViewProvider,
     progress: Callable[[float], None],
 ) -> tuple[Gaussians, FileLimit, SizeSearch]:
-    """The largest scene whose compressed file meets a size, unrounded; the limit with its rounding;
-    and the search. ``start`` is the largest allowed scene, ``make(n)`` returns n Gaussians."""
-    limit = FileLimit(format_to_write(budget.suffix), budget.bytes)
+    """The largest scene whose compressed file meets a limit, unrounded; the limit with its
+    rounding; and the search. ``start`` is the largest allowed scene, ``make(n)`` returns n
+    Gaussians."""
     try:
         reference = DenseReference(dense, views.compared())
         found = largest_within(start, make, limit, progress, lambda scene: reference.psnr(scene)[0])

@@ -186,14 +186,12 @@ def read_back(scene: Gaussians, path: Path, kind: Format) -> Gaussians:
     return usable_part(kind.read(path)).to(scene.device)
 
 
-def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
-    """File size in bytes, and the scene after writing and reading (:func:`read_back`), for a suffix
-    such as ``.spz``."""
-    kind = format_to_write(suffix)
+def through_file(scene: Gaussians, kind: Format) -> tuple[int, Gaussians]:
+    """File size in bytes, and the scene after writing and reading (:func:`read_back`)."""
     if kind.suffix == ".ply":
         return ply_bytes(len(scene), scene.sh_degree), scene
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"scene{suffix}"
+        path = Path(folder) / f"scene{kind.suffix}"
         assert kind.write is not None
         # Without the warning of losses, which is for the final scene.
         kind.write(usable_part(scene.detach().to("cpu", torch.float32)), path, silent)

@@ -15,6 +15,7 @@ from pointsplat_ns.scene.checkpoints import read_checkpoint
 from pointsplat_ns.scene.formats import (
     READABLE,
     SOG_META,
+    SPZ_VERSION,
     STREAM_META,
     Format,
     format_named,
@@ -135,11 +136,15 @@ def kind_of(path: Path | str) -> str:
 
 
 def save(
-    scene: Gaussians, path: Path | str, progress: bool | Progress = False, overwrite: bool = False
+    scene: Gaussians,
+    path: Path | str,
+    progress: bool | Progress = False,
+    overwrite: bool = False,
+    spz_version: int = SPZ_VERSION,
 ) -> None:
     """Write a scene in the format of the path's suffix.
 
-    ``.ply`` is the 3DGS PLY: a float32 scene is read back exact to the bit. ``.spz`` (version 3),
+    ``.ply`` is the 3DGS PLY: a float32 scene is read back exact to the bit. ``.spz``,
     ``.sog``, ``.splat`` and ``.spz.glb`` have fewer bits; ``.glb`` and ``.gltf`` have floats as
     drawn, see :mod:`~pointsplat_ns.scene.formats.gltf`. Gaussians that cannot be drawn (NaN, or Inf
     where it is not valid) are dropped, and their number is logged. The write is atomic.
@@ -151,10 +156,14 @@ def save(
         progress: True shows a progress bar; a function is called with the current step and its
             share done.
         overwrite: whether to replace an existing file.
+        spz_version: version of an ``.spz``: 4, which the format's own library, SuperSplat,
+            PlayCanvas and three.js read; 3 for Spark 2.2 and older viewers; or 2 for viewers from
+            before 2025.
 
     Raises:
         SceneError: if the path has another suffix, is a folder, cannot be written, or exists
             without ``overwrite``.
+        PointSplatError: if SPZ is not written in that version.
 
     Example:
         >>> import tempfile
@@ -165,7 +174,7 @@ def save(
         100
     """
     path = Path(path)
-    kind = format_to_write(path)
+    kind = format_to_write(path, spz_version)
     with outputs_claimed(), progress_bar(progress) as report:
         if not overwrite:
             claim(path)

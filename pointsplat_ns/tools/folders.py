@@ -32,7 +32,7 @@ from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.rendering.comparison.sizes import size_text
 from pointsplat_ns.scene.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.scene.formats import format_like, format_to_write
+from pointsplat_ns.scene.formats import SPZ_VERSION, format_like
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene, save_as, source_file, source_parts
 from pointsplat_ns.system.files import (
@@ -125,6 +125,7 @@ def compact_folder(
     resolution: tuple[int, int] | str | None = None,
     data: str | Path | None = None,
     target_format: str | None = None,
+    spz_version: int = SPZ_VERSION,
     html: str | Path | None = None,
     picture: str | Path | None = None,
     jobs: int = 1,
@@ -148,6 +149,7 @@ def compact_folder(
             :func:`compact`, for each scene.
         data: folder above the data of the runs. A run without data gets sampled views and a note.
         target_format: suffix of all results, such as ".sog"; by default the format of each scene.
+        spz_version: version of ``.spz`` results, as for :func:`~pointsplat_ns.save`.
         html: .html file for a gallery of all scenes before and after, with links to their files;
             written at the end.
         picture: .png file for the same pictures.
@@ -189,6 +191,7 @@ def compact_folder(
         target_db=target_db,
         resolution=resolution,
         data=data,
+        spz_version=spz_version,  # type: ignore[arg-type]
     ).completed(trained)
     size = options.size
     record: dict[str, str | float | bool | None] = {
@@ -203,6 +206,7 @@ def compact_folder(
         "data": None if data is None else str(data),
         "refiner": None if trained is None else source_file(trained.source).sha256,
         "format": target_format,
+        "spz_version": spz_version,
     }
     check_jobs(jobs)
     page, sheet = (None if path is None else Path(path) for path in (html, picture))
@@ -351,7 +355,7 @@ class _Compacting:
         scene counts as open."""
         new = not self.force and not os.path.lexists(task.output)
         dense = read_scene(task.source)
-        kind = format_to_write(task.output)
+        kind = self.options.format_of(task.output.name)
         options = dataclasses.replace(self.options, target_format=kind.suffix)
         views = ViewProvider(dense, run=task.source, data=options.data, resolution=options.size)
         trained = None if self.refiner is None else _loaded(self.refiner, by=options.by)

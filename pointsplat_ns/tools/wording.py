@@ -43,6 +43,26 @@ BEST_PSNR = 60.0
 """Largest PSNR to print, dB. Rounding pictures to 256 levels has 59 dB."""
 
 
+_SPZ_READERS = {
+    4: "the format's own library, SuperSplat, PlayCanvas and three.js read it; Spark 2.2 and older "
+    "viewers need --spz-version 3",
+    3: "the format's own library, SuperSplat, three.js and Spark read it; PlayCanvas' engine needs "
+    "--spz-version 4, viewers from before 2025 need 2",
+    2: "all viewers of SPZ but PlayCanvas' engine read it; rotations are coarser than in 3",
+}
+
+
+def spz_readers(version: int) -> str:
+    """The version of an SPZ file, and the programs that read it."""
+    return f"SPZ {version}: {_SPZ_READERS[version]}"
+
+
+def spz_tiles(version: int) -> str:
+    """The version of SPZ in 3D Tiles, and the program that reads it."""
+    newest = ", the newest that it reads" if version == 3 else ""
+    return f"tiles hold SPZ {version} for CesiumJS{newest}"
+
+
 def decibels(psnr: float) -> str:
     """Text on a PSNR, dB."""
     return f"more than {BEST_PSNR:g} dB" if psnr > BEST_PSNR else f"{psnr:.1f} dB"

@@ -26,7 +26,7 @@ from pointsplat_ns.scene.formats.spz import encode_spz
 
 FILES = {
     ".compressed.ply": encode_compressed_ply(cloud(300, 5, 1)),
-    ".spz": encode_spz(cloud(300, 5, 1)),
+    ".spz": encode_spz(cloud(300, 5, 1), version=3),
     "4.spz": encode_spz4(cloud(300, 5, 1)),
     ".sog": encode_sog(cloud(300, 5, 1)),
     ".glb": encode_glb(cloud(300, 5, 1)),

@@ -1,4 +1,4 @@
-"""Files that are read and not written: SPZ of version 4, and SOG folders."""
+"""Files as other programs write them: SPZ of version 4 with any extensions, and SOG folders."""
 
 import gzip
 import io
@@ -16,7 +16,7 @@ from pointsplat_ns.scene.gaussians import Gaussians
 def encode_spz4(scene: Gaussians, extensions: bytes = b"") -> bytes:
     """The bytes of a file of version 4: what one of version 3 holds, with a stream for each
     attribute."""
-    content = gzip.decompress(encode_spz(scene))
+    content = gzip.decompress(encode_spz(scene, version=3))
     magic, _, n, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", content)
     sizes = [size * n for size in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if size]
     starts = [16 + sum(sizes[:i]) for i in range(len(sizes))]

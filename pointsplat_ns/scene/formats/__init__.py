@@ -12,7 +12,7 @@ import fnmatch
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
@@ -28,7 +28,7 @@ from pointsplat_ns.scene.formats.sog import encode_sog, read_sog, rounded_for_so
 from pointsplat_ns.scene.formats.sog_images import SOG_META
 from pointsplat_ns.scene.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.scene.formats.splat import encode_splat, read_splat
-from pointsplat_ns.scene.formats.spz import encode_spz, read_spz, rounded_for_spz
+from pointsplat_ns.scene.formats.spz import SPZ_VERSION, encode_spz, read_spz, rounded_for_spz
 from pointsplat_ns.scene.formats.tileset import TILESET, read_tileset, tileset_parts
 from pointsplat_ns.scene.gaussians import Gaussians, Traits
 from pointsplat_ns.scene.ply import ply_bytes, read_ply, write_ply
@@ -306,8 +306,10 @@ def _told_by_zip(path: Path) -> Format | None:
     return packed
 
 
-def format_to_write(path: Path | str) -> Format:
-    """The format of an output path; a SceneError if no writable format has its suffix."""
+def format_to_write(path: Path | str, spz_version: int = SPZ_VERSION) -> Format:
+    """The format of an output path, SPZ in the given version. Raises SceneError if no writable
+    format has its suffix, and PointSplatError if SPZ is not written in that version."""
+    spz.require_version(spz_version)
     path = Path(path)
     kind = format_named(path.name)
     if kind is None or kind.write is None:
@@ -315,6 +317,9 @@ def format_to_write(path: Path | str) -> Format:
         if kind is not None and kind.written_by:
             raise SceneError(f"{path}: cannot write {what} here; use `{kind.written_by}`")
         raise SceneError(f"{path}: cannot write {what}; expected a name that ends in {WRITABLE}")
+    if kind.read is read_spz and spz_version != SPZ_VERSION:
+        encode = spz.encoder(spz_version)
+        return replace(kind, write=_writer(encode), encode=encode)
     return kind
 
 

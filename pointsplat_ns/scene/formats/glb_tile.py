@@ -11,13 +11,18 @@ TILE_EXTENSIONS = (SPLATS, SPZ)
 """glTF extensions that a viewer must support to draw tiles."""
 
 
-def encode_tile(scene: Gaussians) -> bytes:
+TILE_SPZ_VERSION = 3
+"""Version of the SPZ inside. The glTF extension is for the second release of the format's library,
+which has versions 2 and 3; CesiumJS 1.145 fails at version 4."""
+
+
+def encode_tile(scene: Gaussians, spz_version: int = TILE_SPZ_VERSION) -> bytes:
     """Encode the N > 0 Gaussians of a scene, float32 on the CPU, as a ``.glb`` for CesiumJS.
 
     The scene is z-up, as 3D Tiles are. Its node rotates it to glTF's y-up and moves it to its
     offset. The SPZ keeps the scene's axes.
     """
-    packed = encode_spz(scene.replace(offset=None))
+    packed = encode_spz(scene.replace(offset=None), version=spz_version)
     x, y, z = scene.offset or (0.0, 0.0, 0.0)
     # columns
     node = {"matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, x, z, -y, 1]}

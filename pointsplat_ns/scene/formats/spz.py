@@ -1,16 +1,19 @@
 """SPZ files: Niantic's compressed format, 20 bytes a Gaussian and one per SH coefficient.
 
 Versions 2 and 3 are one gzip stream, with quaternions of three and four bytes. Version 4 has one
-zstd stream per attribute. Versions 2 to 4 are read; version 3 is written, because most viewers read
-it. Positions are 24-bit fixed point. The format's documentation requires axes right, up, back; axes
-are not converted here, as in most converters.
+zstd stream per attribute. Positions are 24-bit fixed point. A file may declare its axes; without a
+declaration they are not converted, as in most converters, although the format's documentation
+requires right, up, back.
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,14 +21,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import SceneError
-from pointsplat_ns.scene.formats import coding
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.scene.formats import coding, spz_levels
 from pointsplat_ns.scene.formats.capacity import Capacity, Span, typical_sizes, within_colours
-from pointsplat_ns.scene.formats.coding import Array, Blocks
+from pointsplat_ns.scene.formats.coding import Blocks
 from pointsplat_ns.scene.formats.rounding import rounded
+from pointsplat_ns.scene.formats.spz_extensions import DECLARED_AXES, records_of, turned_back
+from pointsplat_ns.scene.formats.spz_values import COLOUR_SCALE, SIZES, decoded, encoded
 from pointsplat_ns.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.system.files import logger, require_file
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.threads import parallel_map
+
+SPZ_VERSION = 4
+"""The version that is written by default: that of the format's own library."""
 
 FRACTION_BITS = 12
 MAX_FRACTION_BITS = 23
@@ -35,13 +44,25 @@ maximum. Scenes of smaller Gaussians get more, and scenes that reach farther get
 FARTHEST = 2**23 - 1
 """Largest distance of a position from the origin, in steps."""
 
-_COLOUR_SCALE = 0.15
+GZIP_LEVEL = 9
+ZSTD_LEVEL = 17
+"""Effort of compression: of versions 2 and 3, where 6 takes a quarter of the time for 3 % more
+bytes; and of version 4, which takes as long, for 6 % less than version 3. Level 12, the library's,
+takes an eighth of the time for the bytes of version 3, and 19 the double for 1 or 2 % less."""
+
+MAX_EXTENSION_BYTES = 1 << 20
+"""Most bytes of extensions in versions 2 and 3, which do not declare their size."""
+
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, then the fields of _Head
+_HEADER_4 = 32
+"""Size of the header of version 4: the common one, the start of the table (u32), and zeros."""
+
 # flags
-_ANTIALIASED = 1
-_EXTENDED = 2
-_XYZW = np.array([1, 2, 3, 0])  # SPZ has w last
+_ANTIALIASED = 0x01
+_EXTENDED = 0x02
+_LEVELS = 0x80
+"""Levels of detail of Spark, only in versions 2 and 3."""
 
 
 @dataclass(frozen=True)
@@ -64,62 +85,127 @@ class _Head:
         n = self.count
         return (9 * n, n, 3 * n, 3 * n, (3 if self.version == 2 else 4) * n, 3 * self.rest * n)
 
+    @property
+    def link_bytes(self) -> int:
+        """Bytes of the links of Spark's tree."""
+        return spz_levels.NODE_BYTES * self.count if self.flags & _LEVELS else 0
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What an SPZ file holds, decompressed."""
+
+    head: _Head
+    parts: list[bytes | memoryview]
+    """Attributes, with the sizes of the header."""
+    extensions: bytes | memoryview = b""
+    levels: bytes | memoryview = b""
+    """Links of Spark's tree."""
+
 
 def read_spz(path: Path | str) -> Gaussians:
     """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.scene.read_scene` does.
 
-    Axes are not converted. The highest band of SH degree 4, and extensions, are not read; both are
-    logged. Raises SceneError if the file has another format or version, is truncated, or declares
-    more than it can hold.
+    A file that declares its axes is turned to those of a PLY. Of a file with Spark's levels of
+    detail, the leaves are read. The highest band of SH degree 4, unknown extensions and unknown
+    flags are ignored, and logged. Raises SceneError if the file has another format or version, is
+    truncated, or declares more than it can hold.
     """
     path = require_file(path, "an SPZ file")
     with coding.damage_named(path, "SPZ"):
-        data = coding.load_bytes(path)
-        if data[:2] == b"\x1f\x8b":
-            head, parts = _parts_of_gzip(data, path)
-        elif data[:4] == _MAGIC:
-            head, parts = _parts_of_zstd(data, path)
-        else:
-            raise SceneError(
-                f"{path}: not an SPZ file (starts with {data[:4]!r}); expected gzip or {_MAGIC!r}"
-            )
-        if head.flags & _EXTENDED:
-            logger.warning("%s: extensions of the SPZ file are not read", path)
-        if head.degree > MAX_SH_DEGREE:
-            logger.warning(
-                "%s: SH degree %d, read up to degree %d", path, head.degree, MAX_SH_DEGREE
-            )
-        return _decode(head, parts).replace(antialiased=bool(head.flags & _ANTIALIASED))
+        return decode_spz(coding.load_bytes(path), path)
 
 
-def encode_spz(scene: Gaussians, progress: Progress = silent, level: int = 9) -> bytes:
-    """Encode a scene as an SPZ file of version 3, after :func:`fitted` moved it into range.
+def decode_spz(data: bytes, path: Path) -> Gaussians:
+    """The scene of the bytes of an SPZ file, as :func:`read_spz`; ``path`` is for messages."""
+    if data[:2] == b"\x1f\x8b":
+        content = _from_gzip(data, path)
+    elif data[:4] == _MAGIC:
+        content = _from_zstd(data, path)
+    else:
+        raise SceneError(
+            f"{path}: not an SPZ file (starts with {data[:4]!r}); expected gzip or {_MAGIC!r}"
+        )
+    head = content.head
+    if head.degree > MAX_SH_DEGREE:
+        logger.warning("%s: SH degree %d, read up to degree %d", path, head.degree, MAX_SH_DEGREE)
+    parts = [np.frombuffer(part, np.uint8) for part in content.parts]
+    factor = 1
+    if head.flags & _LEVELS:
+        mask = spz_levels.leaves(content.levels, head.count, path)
+        logger.info(
+            "%s: levels of detail of Spark; the %d leaves of %d nodes are read",
+            path,
+            mask.sum(),
+            head.count,
+        )
+        parts = [part.reshape(head.count, -1)[mask].reshape(-1) for part in parts]
+        factor = spz_levels.OPACITY_FACTOR
+    scene = decoded(parts, head.rest, head.fraction_bits, factor)
+    scene = turned_back(scene, records_of(content.extensions, path), path)
+    return scene.replace(antialiased=bool(head.flags & _ANTIALIASED))
+
+
+def encode_spz(
+    scene: Gaussians,
+    progress: Progress = silent,
+    version: int = SPZ_VERSION,
+    level: int = GZIP_LEVEL,
+) -> bytes:
+    """Encode a scene as an SPZ file, after :func:`fitted` moved it into range.
 
     SH that were read from an SPZ file, or rounded for one, are unchanged. Others get 6 bits at
     degree 1 and 5 bits above, which compress better. The format's own programs use 5 and 4 bits, in
-    a file a seventh smaller.
+    a file a seventh smaller. Version 4 declares the axes of a PLY. Versions 2 and 3 declare none,
+    because old readers refuse files with extensions.
 
     Args:
         scene: N Gaussians, float32 on the CPU.
         progress: called during compression.
-        level: gzip level, 1 to 9. 6 takes a tenth of the time of 9, for 3 % more bytes.
+        version: 4, 3 or 2.
+        level: gzip level of versions 2 and 3, 1 to 9.
 
     Raises:
         SceneError: if the scene is too large for the format.
+        PointSplatError: if the version is another one.
     """
-    levels = 128 * scene.features_rest
-    sh_bits = (8, 8) if torch.equal(levels, levels.round()) else (6, 5)
-    n = len(scene)
+    require_version(version)
+    steps = 128 * scene.features_rest
+    sh_bits = (8, 8) if torch.equal(steps, steps.round()) else (6, 5)
     flags = _ANTIALIASED if scene.antialiased else 0
     scene, _ = fitted(scene)
     bits = fraction_bits(scene)
-    parts = _encode(scene, bits, sh_bits)
+    parts = encoded(scene, bits, sh_bits, quat_bytes=3 if version == 2 else 4)
+    head = (_MAGIC, version, len(scene), scene.sh_degree, bits)
+    if version == 4:
+        return _to_zstd(head, flags, parts, progress)
     packer = zlib.compressobj(level, zlib.DEFLATED, 31)
-    packed = [packer.compress(_HEADER.pack(_MAGIC, 3, n, scene.sh_degree, bits, flags, 0))]
+    packed = [packer.compress(_HEADER.pack(*head, flags, 0))]
     for index, part in enumerate(parts):
         progress("compressing", index / len(parts))
         packed.append(packer.compress(part))
     return b"".join([*packed, packer.flush()])
+
+
+def encoder(version: int) -> Callable[[Gaussians, Progress], bytes]:
+    """:func:`encode_spz` with a version. Raises PointSplatError if there is no such version."""
+    require_version(version)
+    return functools.partial(encode_spz, version=version)
+
+
+def version_of(path: Path) -> int:
+    """Version of an SPZ file, from its header. Raises SceneError if it is none."""
+    with coding.damage_named(path, "SPZ"), path.open("rb") as stream:
+        start = stream.read(512)
+        if start[:2] == b"\x1f\x8b":
+            start = zlib.decompressobj(31).decompress(start, _HEADER.size)
+        return int(_HEADER.unpack(start[: _HEADER.size])[1])
+
+
+def require_version(version: int) -> None:
+    """Raise a PointSplatError if a version of SPZ is not written."""
+    if version not in (2, 3, 4):
+        raise PointSplatError(f"SPZ version {version!r} is not written; expected 4, 3 or 2")
 
 
 def rounded_for_spz(scene: Gaussians, tolerance: float) -> Gaussians:
@@ -213,8 +299,8 @@ def _position_steps(scene: Gaussians) -> Tensor:
 
 
 CAPACITY = Capacity(
-    sizes=Span(-10.0, -10.0 + 255 / 16, 1 / 16),
-    colours=Span(-0.5 / _COLOUR_SCALE, 0.5 / _COLOUR_SCALE, 1 / (255 * _COLOUR_SCALE)),
+    sizes=SIZES,
+    colours=Span(-0.5 / COLOUR_SCALE, 0.5 / COLOUR_SCALE, 1 / (255 * COLOUR_SCALE)),
     sh=Span(-1.0, 127 / 128, 1 / 128),
     position_steps=_position_steps,
     fitted=fitted,
@@ -242,30 +328,57 @@ def _head(data: bytes, versions: tuple[int, ...], packed: int, path: Path) -> _H
             f"{path}: {head.fraction_bits} fractional bits; expected at most {MAX_FRACTION_BITS} "
             "of 24"
         )
-    coding.require_plausible(path, sum(head.sizes), packed, head.count, head.rest)
+    _check_flags(head, path)
+    unpacked = sum(head.sizes) + head.link_bytes
+    coding.require_plausible(path, unpacked, packed, head.count, head.rest)
     return head
 
 
-def _parts_of_gzip(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryview]]:
-    """Header and attributes of versions 2 and 3. Decompresses no more than the header declares."""
+def _check_flags(head: _Head, path: Path) -> None:
+    """Log unknown flags. Raises SceneError for levels of detail in a version without them."""
+    if head.version == 4 and head.flags & _LEVELS:
+        raise SceneError(
+            f"{path}: SPZ of version 4 with the flag of Spark's levels of detail "
+            f"(0x{_LEVELS:02x}), known in versions 2 and 3; export the scene itself"
+        )
+    unknown = head.flags & ~(_ANTIALIASED | _EXTENDED | _LEVELS)
+    if unknown:
+        named = ", ".join(f"0x{1 << bit:02x}" for bit in range(8) if unknown >> bit & 1)
+        logger.warning(
+            "%s: flags of the SPZ file that are not known (%s) are ignored; compare the scene with "
+            "what the program shows that wrote it",
+            path,
+            named,
+        )
+
+
+def _from_gzip(data: bytes, path: Path) -> _Content:
+    """Versions 2 and 3. Decompresses no more than the header declares."""
     head = _head(zlib.decompressobj(31).decompress(data, _HEADER.size), (2, 3), len(data), path)
-    content = zlib.decompressobj(31).decompress(data, _HEADER.size + sum(head.sizes))
+    size = _HEADER.size + sum(head.sizes) + head.link_bytes
+    more = MAX_EXTENSION_BYTES if head.flags & _EXTENDED else 0
+    content = zlib.decompressobj(31).decompress(data, size + more)
     blocks = Blocks(content, path, _HEADER.size)
-    return head, [blocks.take("u1", length).data for length in head.sizes]
+    return _Content(
+        head=head,
+        parts=[blocks.take("u1", length).data for length in head.sizes],
+        levels=blocks.take("u1", head.link_bytes).data,
+        extensions=memoryview(content)[size:],
+    )
 
 
-def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryview]]:
-    """Header and attributes of version 4. Decompresses no more than the header declares."""
+def _from_zstd(data: bytes, path: Path) -> _Content:
+    """Version 4. Decompresses no more than the header declares."""
     from zstandard import ZstdDecompressor, ZstdError
 
     head = _head(data, (4,), len(data), path)
     sizes = [size for size in head.sizes if size]
     # start of the table; extensions come before it
     table = int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])
-    if head.streams != len(sizes) or table < 32:
+    if head.streams != len(sizes) or table < _HEADER_4:
         raise SceneError(
             f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from "
-            "byte 32 on"
+            f"byte {_HEADER_4} on"
         )
     blocks = Blocks(data, path, table)
     lengths = blocks.take("<u8", len(sizes), 2).tolist()
@@ -285,83 +398,37 @@ def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
             raise SceneError(
                 f"{path}: truncated; a stream ends after {len(parts[-1])} of {size} bytes"
             )
-    return head, parts + [b""] * (len(head.sizes) - len(parts))
-
-
-def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:
-    n = head.count
-    positions, alphas, colors, scales, quats, sh = (np.frombuffer(part, np.uint8) for part in parts)
-    rest = min(head.rest, (MAX_SH_DEGREE + 1) ** 2 - 1)
-    return coding.scene_of(
-        _from_fixed_point(positions.reshape(n, 3, 3), head.fraction_bits),
-        scales.reshape(n, 3).astype(np.float32) * np.float32(CAPACITY.sizes.step)
-        + np.float32(CAPACITY.sizes.low),
-        _quats_of_three(quats) if head.version == 2 else _quats_of_four(quats),
-        coding.logits_of_bytes(alphas),
-        (colors.reshape(n, 3).astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE,
-        (sh.reshape(n, head.rest, 3)[:, :rest].astype(np.float32) - 128) / 128,
+    return _Content(
+        head=head,
+        parts=parts + [b""] * (len(head.sizes) - len(parts)),
+        extensions=memoryview(data)[_HEADER_4:table] if head.flags & _EXTENDED else b"",
     )
 
 
-def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes]:
-    """The attributes in file order."""
-    bands = scene.features_rest[:, :3], scene.features_rest[:, 3:]  # degree 1, and above
-    first, other = (
-        _coarse(band.numpy(), count) for band, count in zip(bands, sh_bits, strict=True)
+def _to_zstd(
+    head: tuple[bytes, int, int, int, int], flags: int, parts: list[bytes], progress: Progress
+) -> bytes:
+    """Version 4: the header, the declared axes, a table of packed and unpacked lengths (u64), and a
+    zstd stream for each attribute that is not empty."""
+    filled = [part for part in parts if part]
+    streams: list[bytes] = []
+    for stream in parallel_map(_zstd_stream, filled, torch.device("cpu")):
+        progress("compressing", len(streams) / len(filled))
+        streams.append(stream)
+    table = itertools.chain.from_iterable(zip(map(len, streams), map(len, filled), strict=True))
+    start = _HEADER_4 + len(DECLARED_AXES)
+    return b"".join(
+        [
+            _HEADER.pack(*head, flags | _EXTENDED, len(filled)),
+            struct.pack("<I12x", start),
+            DECLARED_AXES,
+            struct.pack(f"<{2 * len(filled)}Q", *table),
+            *streams,
+        ]
     )
-    fixed = np.rint(np.ldexp(scene.means.double().numpy(), bits)).astype("<i4")
-    largest, others = coding.smallest_three(coding.unit_quats(scene)[:, _XYZW])
-    magnitudes = (
-        np.rint(np.abs(others) * 2**0.5 * 511).astype(np.uint32)
-        | (others < 0).astype(np.uint32) << 9
-    )
-    words = (
-        largest.astype(np.uint32) << 30
-        | magnitudes[:, 0] << 20
-        | magnitudes[:, 1] << 10
-        | magnitudes[:, 2]
-    )
-    return [
-        np.ascontiguousarray(fixed[..., None]).view(np.uint8)[..., :3].tobytes(),
-        coding.bytes_of_logits(scene).tobytes(),
-        coding.to_bytes((scene.features_dc.double().numpy() * _COLOUR_SCALE + 0.5) * 255).tobytes(),
-        coding.to_bytes(
-            (scene.scales.double() - CAPACITY.sizes.low) / CAPACITY.sizes.step
-        ).tobytes(),
-        words.astype("<u4").tobytes(),
-        np.concatenate([first, other], axis=1).tobytes(),
-    ]
 
 
-def _coarse(coefficients: Array, bits: int) -> Array:
-    """SH coefficients as bytes of which only the upper ``bits`` differ; 0 stays 0."""
-    step = 1 << (8 - bits)
-    levels = np.rint(coefficients.astype(np.float64) * 128 / step) * step + 128
-    return np.clip(levels, 0, 255).astype(np.uint8)
+def _zstd_stream(part: bytes) -> bytes:
+    from zstandard import ZstdCompressor
 
-
-def _from_fixed_point(parts: Array, bits: int) -> Array:
-    """Positions (N, 3) from three bytes each, (N, 3, 3), lowest byte first."""
-    low, middle, high = (parts[..., i].astype(np.int32) for i in range(3))
-    signed = (low | middle << 8 | high << 16) << 8 >> 8  # sign extension
-    return np.ldexp(signed.astype(np.float32), -bits)
-
-
-def _quats_of_three(packed: Array) -> Array:
-    """Version 2: x, y and z in a byte each; w is positive."""
-    xyz = packed.reshape(-1, 3).astype(np.float32) / 127.5 - 1
-    w = np.sqrt(np.clip(1 - np.square(xyz).sum(axis=1, keepdims=True), 0, None))
-    return np.concatenate([w, xyz], axis=1)
-
-
-def _quats_of_four(packed: Array) -> Array:
-    """From version 3: index of the largest component; nine bits and a sign for the others."""
-    words = packed.view("<u4")
-    levels = (
-        np.stack([words >> shift & 511 for shift in (20, 10, 0)], axis=1).astype(np.float32) / 511
-    )
-    negative = np.stack([words >> shift & 512 for shift in (20, 10, 0)], axis=1) > 0
-    others = np.where(negative, -levels, levels) * 0.5**0.5
-    quats = np.empty((len(words), 4), np.float32)
-    quats[:, _XYZW] = coding.from_smallest_three((words >> 30).astype(np.int64), others)
-    return quats
+    return ZstdCompressor(level=ZSTD_LEVEL).compress(part)

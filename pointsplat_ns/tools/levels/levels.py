@@ -31,6 +31,7 @@ from pointsplat_ns.pruning import Keep, found_by_trying, need_usable, parse_keep
 from pointsplat_ns.pruning.merging import merge_levels
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats.capacity import typical_sizes
+from pointsplat_ns.scene.formats.glb_tile import TILE_SPZ_VERSION
 from pointsplat_ns.scene.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.scene.gaussians import Gaussians, Traits
 from pointsplat_ns.scene.reading import SourceFile
@@ -207,6 +208,8 @@ class LevelOutput:
     """Place of the scene on the Earth, for tiles."""
     up: str | None
     force: bool
+    spz_version: int = TILE_SPZ_VERSION
+    """Version of the SPZ in tiles."""
 
     @classmethod
     def of(
@@ -217,12 +220,18 @@ class LevelOutput:
         at: str | None,
         up: str | None,
         force: bool,
+        spz_version: int | None = None,
     ) -> LevelOutput | None:
         """The output from options of :func:`pointsplat_ns.lod`; None if nothing is written. Raises
         PointSplatError if options contradict each other."""
         if stream and tiles or at is not None and not tiles:
             raise PointSplatError(
                 "expected either a stream or 3D Tiles; a place on the Earth needs tiles"
+            )
+        if spz_version not in (None, 2, 3) or spz_version is not None and not tiles:
+            raise PointSplatError(
+                f"SPZ version {spz_version} of levels; expected 3 or 2, which CesiumJS reads, and "
+                "3D Tiles"
             )
         if at is not None:
             Place.parse(at)
@@ -235,6 +244,7 @@ class LevelOutput:
             at,
             up,
             force,
+            TILE_SPZ_VERSION if spz_version is None else spz_version,
         )
 
     def check(self, count: int) -> None:
@@ -258,7 +268,16 @@ class LevelOutput:
             about, matrix = placed(levels.scenes, levels.dense, self.at, self.up)
             parents = [of.cpu() for of in levels.parents]
             sizes = levels.pixel_sizes()
-            write_tiles(self.path, about, parents, sizes, matrix, progress, force=self.force)
+            write_tiles(
+                self.path,
+                about,
+                parents,
+                sizes,
+                matrix,
+                progress,
+                force=self.force,
+                spz_version=self.spz_version,
+            )
         else:
             write_stream(self.path, levels.scenes, levels.parents, progress, self.force)
             if levels.judge is not None:

@@ -16,7 +16,7 @@ from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.geometry.transforms import smallest_turn
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.formats.capacity import typical_sizes
-from pointsplat_ns.scene.formats.glb_tile import TILE_EXTENSIONS, encode_tile
+from pointsplat_ns.scene.formats.glb_tile import TILE_EXTENSIONS, TILE_SPZ_VERSION, encode_tile
 from pointsplat_ns.scene.formats.gltf_nodes import EXTRAS
 from pointsplat_ns.scene.formats.tileset import TILESET
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -68,6 +68,7 @@ def write_tiles(
     progress: Progress = silent,
     most: int = 1 << 16,
     force: bool = True,
+    spz_version: int = TILE_SPZ_VERSION,
 ) -> list[int]:
     """Write levels of detail as 3D Tiles of glTF with SPZ, for CesiumJS: all of them, or nothing.
 
@@ -84,6 +85,7 @@ def write_tiles(
         progress: called while encoding.
         most: maximum number of Gaussians in a tile; children of one parent stay together.
         force: whether existing files may be replaced.
+        spz_version: 3 or 2.
 
     Returns:
         The number of written Gaussians per level.
@@ -105,7 +107,7 @@ def write_tiles(
         low, high = _box(scene)
         x, y, z = (0.5 * (low + high)).tolist()
         name = f"tiles/{cell.level}_{index}.glb"
-        data = encode_tile(scene.at_offset((x, y, z)))
+        data = encode_tile(scene.at_offset((x, y, z)), spz_version)
         with replacing(beside / name, len(data)) as place:
             place.write_bytes(data)
         counts[cell.level] += len(scene)

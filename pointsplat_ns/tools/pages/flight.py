@@ -81,7 +81,7 @@ class FlightFrame:
             logger.warning(
                 "%s: %d distant or non-finite Gaussians are left out of the page", name, left_out
             )
-        return encode_spz(placed[near], progress, level=level)
+        return encode_spz(placed[near], progress, version=3, level=level)
 
     def packed(self, scene: Gaussians, name: str, progress: Progress = silent) -> dict[str, str]:
         """A scene for the page: name, count, and SPZ data in units of the content as base64."""
