@@ -33,6 +33,7 @@ from pointsplat_ns.pipeline.quality import through_file
 from pointsplat_ns.pipeline.repair_budget import PHOTO_STEPS, STEPS, PhotoBudget
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rendering import render
+from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.views import EPS2D
 from pointsplat_ns.tools.wording import stage_text
 from pointsplat_ns.view_sampling.sampler import sample_views
@@ -175,7 +176,7 @@ def test_auto_finds_the_smallest_file_that_loses_little_in_held_out_photos(hollo
     )
     before, after = (
         mean_psnr(s, held_out, [0, 1, 2])
-        for s in (hollow_ball, through_file(found.scene, ".sog")[1])
+        for s in (hollow_ball, through_file(found.scene, format_to_write(".sog"))[1])
     )
     assert 2.0 <= after - before < 3.0 and len(found.scene) < 0.7 * len(hollow_ball)
     assert found.target is not None

@@ -20,6 +20,7 @@ from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.rendering import render
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.rendering.comparison.fill import fill
+from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.reading import save
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.tools.wording import quality_details, quality_text
@@ -56,7 +57,7 @@ def test_few_pixels_of_large_pictures_stand_for_all(dense):
 def test_a_file_that_loses_is_judged_as_it_is_read(dense, tmp_path):
     source = ViewProvider(dense, sample_views(dense, 2, 64, 48))
     save(dense, tmp_path / "same.splat")
-    read = through_file(dense, ".splat")[1]
+    read = through_file(dense, format_to_write(".splat"))[1]
     wanted = Judge(dense, source).quality(read)
     assert 10 < wanted.psnr < 60 and "looks the same" not in quality_text(wanted)
     assert quality_of_file(Judge(dense, source), dense, tmp_path / "same.splat") == wanted

@@ -14,6 +14,7 @@ from pointsplat_ns.pipeline import stages, view_provider
 from pointsplat_ns.pipeline.quality import Judge, quality_of_file, through_file
 from pointsplat_ns.pipeline.repair import Repaired
 from pointsplat_ns.pipeline.view_provider import ViewProvider
+from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.view_sampling.sampler import sample_views
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -54,7 +55,8 @@ def test_the_file_that_is_written_has_the_quality_and_few_gaussians(dense, views
     assert found.target.gaussians == len(found.scene)
     assert (found.stages[-1].stage == "round") == (suffix != ".ply")
     fewer = ps.compact(dense, round(0.85 * len(found.scene)), by="opacity")  # which is not rounded
-    assert Judge(dense, ViewProvider(dense)).psnr(through_file(fewer.scene, suffix)[1])[0] < 25
+    _, written = through_file(fewer.scene, format_to_write(suffix))
+    assert Judge(dense, ViewProvider(dense)).psnr(written)[0] < 25
 
 
 def test_each_count_is_repaired_and_has_the_sh_bands_that_are_asked_for(dense, monkeypatch):
