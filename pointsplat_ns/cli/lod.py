@@ -66,7 +66,7 @@ def lod(
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.scene.discovery import FOLDER_FILES
-    from pointsplat_ns.scene.formats.glb_tile import TILE_SPZ_VERSION
+    from pointsplat_ns.scene.formats.gltf import SPZ_INSIDE
 
     options.need_one_scene(scene)
     options.check_poses(view_options.poses)
@@ -98,7 +98,7 @@ def lod(
             {"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))}
         )
     else:
-        _print_table(made, folder, (spz_version or TILE_SPZ_VERSION) if tiles else None)
+        _print_table(made, folder, (spz_version or SPZ_INSIDE) if tiles else None)
     if made.interrupted:
         raise KeyboardInterrupt  # once the levels are written and printed
 

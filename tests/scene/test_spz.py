@@ -17,6 +17,8 @@ from making import cloud, normal_scene, same_bits
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.pipeline.quality import Judge
 from pointsplat_ns.pipeline.view_provider import ViewProvider
+from pointsplat_ns.scene.formats.gltf import content_with_spz
+from pointsplat_ns.scene.formats.gltf_container import pack_glb
 from pointsplat_ns.scene.formats.spz import decode_spz, encode_spz, version_of
 from pointsplat_ns.scene.formats.spz_extensions import AXES
 
@@ -156,6 +158,20 @@ def test_a_file_that_is_written_and_read_keeps_its_axes(tmp_path, caplog):
     ps.save(scene, tmp_path / "a.spz")
     assert torch.equal(ps.load(tmp_path / "a.spz").means, scene.means)
     assert not caplog.messages
+
+
+def test_in_gltf_the_nodes_turn_and_declared_axes_do_not(tmp_path):
+    scene = ps.load(CASES / "spz4_rub_extension.spz")
+    data = (CASES / "spz4_rub_extension.spz").read_bytes()
+    kept = decode_spz(data, Path("a"), axes=False)
+    signs = torch.tensor([1.0, -1.0, -1.0])
+    assert torch.equal(kept.means, scene.means * signs)
+    packed = pack_glb(content_with_spz(kept, len(data), {}), data)
+    (tmp_path / "a.glb").write_bytes(packed)
+    (tmp_path / "b.glb").write_bytes(
+        pack_glb(content_with_spz(kept, len(plain := encode_spz(kept, version=3)), {}), plain)
+    )
+    assert torch.equal(ps.load(tmp_path / "a.glb").means, ps.load(tmp_path / "b.glb").means)
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])

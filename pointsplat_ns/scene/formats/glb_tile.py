@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pointsplat_ns.scene.formats.gltf import SPLATS, SPZ, content_with_spz
+from pointsplat_ns.scene.formats.gltf import SPLATS, SPZ, SPZ_INSIDE, content_with_spz
 from pointsplat_ns.scene.formats.gltf_container import pack_glb
 from pointsplat_ns.scene.formats.spz import encode_spz
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -11,12 +11,7 @@ TILE_EXTENSIONS = (SPLATS, SPZ)
 """glTF extensions that a viewer must support to draw tiles."""
 
 
-TILE_SPZ_VERSION = 3
-"""Version of the SPZ inside. The glTF extension is for the second release of the format's library,
-which has versions 2 and 3; CesiumJS 1.145 fails at version 4."""
-
-
-def encode_tile(scene: Gaussians, spz_version: int = TILE_SPZ_VERSION) -> bytes:
+def encode_tile(scene: Gaussians, spz_version: int = SPZ_INSIDE) -> bytes:
     """Encode the N > 0 Gaussians of a scene, float32 on the CPU, as a ``.glb`` for CesiumJS.
 
     The scene is z-up, as 3D Tiles are. Its node rotates it to glTF's y-up and moves it to its

@@ -7,7 +7,6 @@ to 1, quaternions xyzw, SH coefficients. In place of attributes, a primitive may
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -46,6 +45,10 @@ from pointsplat_ns.system.progress import Progress, silent
 SPLATS = "KHR_gaussian_splatting"
 SPZ = f"{SPLATS}_compression_spz_2"
 """Names of the extensions."""
+
+SPZ_INSIDE = 3
+"""Version of SPZ in glTF. The extension is for the second release of the format's library, which
+has versions 2 and 3; CesiumJS 1.145 fails at version 4."""
 
 _SPZ_NAMES = (SPZ, f"{SPLATS}_compression_spz", "KHR_spz_gaussian_splats_compression")
 """Names of the extension of SPZ, the newest first; the last one stands beside the other
@@ -170,7 +173,7 @@ def encode_spz_glb(scene: Gaussians, progress: Progress = silent) -> bytes:
     if the scene is too large for SPZ."""
     if not len(scene):
         return encode_glb(scene)
-    packed = spz.encode_spz(scene.replace(offset=None), progress)
+    packed = spz.encode_spz(scene.replace(offset=None), progress, version=SPZ_INSIDE)
     return pack_glb(content_with_spz(scene, len(packed), node_of(scene)), packed)
 
 
@@ -375,21 +378,14 @@ def _gaussians(gltf: Container, primitive: dict[str, Any]) -> Gaussians:
 
 
 def _of_spz(gltf: Container, packed: dict[str, Any], attributes: dict[str, Any]) -> Gaussians:
-    scene = _spz_inside(bytes(gltf.view(packed["bufferView"])), gltf.path)
+    inside = Path(f"{gltf.path}: SPZ inside")  # for messages
+    data = bytes(gltf.view(packed["bufferView"]))
+    with coding.damage_named(inside, "SPZ"):
+        scene = spz.decode_spz(data, inside, axes=False)  # nodes turn it
     declared = gltf.count(attributes["POSITION"]) if "POSITION" in attributes else len(scene)
     if declared != len(scene):
         raise ValueError(f"an SPZ file of {len(scene)} Gaussians, declared as {declared}")
     return scene
-
-
-def _spz_inside(data: bytes, path: Path) -> Gaussians:
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "inside.spz"
-        file.write_bytes(data)
-        try:
-            return spz.read_spz(file)
-        except SceneError as error:
-            raise SceneError(str(error).replace(str(file), f"{path}: SPZ inside")) from error
 
 
 def _of_attributes(gltf: Container, attributes: dict[str, Any]) -> Gaussians:

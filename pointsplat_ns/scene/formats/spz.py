@@ -116,8 +116,9 @@ def read_spz(path: Path | str) -> Gaussians:
         return decode_spz(coding.load_bytes(path), path)
 
 
-def decode_spz(data: bytes, path: Path) -> Gaussians:
-    """The scene of the bytes of an SPZ file, as :func:`read_spz`; ``path`` is for messages."""
+def decode_spz(data: bytes, path: Path, axes: bool = True) -> Gaussians:
+    """The scene of the bytes of an SPZ file, as :func:`read_spz`. ``path`` is for messages, and
+    without ``axes`` the scene keeps the axes of the file."""
     if data[:2] == b"\x1f\x8b":
         content = _from_gzip(data, path)
     elif data[:4] == _MAGIC:
@@ -142,7 +143,7 @@ def decode_spz(data: bytes, path: Path) -> Gaussians:
         parts = [part.reshape(head.count, -1)[mask].reshape(-1) for part in parts]
         factor = spz_levels.OPACITY_FACTOR
     scene = decoded(parts, head.rest, head.fraction_bits, factor)
-    scene = turned_back(scene, records_of(content.extensions, path), path)
+    scene = turned_back(scene, records_of(content.extensions, path), path, axes)
     return scene.replace(antialiased=bool(head.flags & _ANTIALIASED))
 
 

@@ -63,9 +63,12 @@ def records_of(data: bytes | memoryview, path: Path) -> list[tuple[int, bytes]]:
     return records
 
 
-def turned_back(scene: Gaussians, records: list[tuple[int, bytes]], path: Path) -> Gaussians:
-    """A scene turned from the axes that records declare to those of a PLY (right, down, front). All
-    other records are ignored, and logged. Raises SceneError if the axes are not a number."""
+def turned_back(
+    scene: Gaussians, records: list[tuple[int, bytes]], path: Path, turn: bool = True
+) -> Gaussians:
+    """A scene turned from the axes that records declare to those of a PLY (right, down, front),
+    unless ``turn`` is False. All other records are ignored, and logged. Raises SceneError if the
+    axes are not a number."""
     axes = 0
     for kind, content in records:
         if kind != AXES:
@@ -83,7 +86,7 @@ def turned_back(scene: Gaussians, records: list[tuple[int, bytes]], path: Path) 
             axes = axes or int.from_bytes(content, "little")
             if not 1 <= axes <= len(_SYSTEMS):
                 logger.warning("%s: declares unknown axes (%d), which are ignored", path, axes)
-    if axes == _RDF or not 1 <= axes <= len(_SYSTEMS):
+    if not turn or axes == _RDF or not 1 <= axes <= len(_SYSTEMS):
         return scene
     logger.info("%s: turned back from the axes that it declares, %s", path, _SYSTEMS[axes - 1])
     return turned(scene, _matrix_from(axes))

@@ -31,7 +31,7 @@ from pointsplat_ns.pruning import Keep, found_by_trying, need_usable, parse_keep
 from pointsplat_ns.pruning.merging import merge_levels
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.scene.formats.capacity import typical_sizes
-from pointsplat_ns.scene.formats.glb_tile import TILE_SPZ_VERSION
+from pointsplat_ns.scene.formats.gltf import SPZ_INSIDE
 from pointsplat_ns.scene.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.scene.gaussians import Gaussians, Traits
 from pointsplat_ns.scene.reading import SourceFile
@@ -208,7 +208,7 @@ class LevelOutput:
     """Place of the scene on the Earth, for tiles."""
     up: str | None
     force: bool
-    spz_version: int = TILE_SPZ_VERSION
+    spz_version: int = SPZ_INSIDE
     """Version of the SPZ in tiles."""
 
     @classmethod
@@ -244,7 +244,7 @@ class LevelOutput:
             at,
             up,
             force,
-            TILE_SPZ_VERSION if spz_version is None else spz_version,
+            SPZ_INSIDE if spz_version is None else spz_version,
         )
 
     def check(self, count: int) -> None:

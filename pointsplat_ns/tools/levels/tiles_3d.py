@@ -16,7 +16,8 @@ from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.geometry.transforms import smallest_turn
 from pointsplat_ns.scene.formats import format_to_write
 from pointsplat_ns.scene.formats.capacity import typical_sizes
-from pointsplat_ns.scene.formats.glb_tile import TILE_EXTENSIONS, TILE_SPZ_VERSION, encode_tile
+from pointsplat_ns.scene.formats.glb_tile import TILE_EXTENSIONS, encode_tile
+from pointsplat_ns.scene.formats.gltf import SPZ_INSIDE
 from pointsplat_ns.scene.formats.gltf_nodes import EXTRAS
 from pointsplat_ns.scene.formats.tileset import TILESET
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -68,7 +69,7 @@ def write_tiles(
     progress: Progress = silent,
     most: int = 1 << 16,
     force: bool = True,
-    spz_version: int = TILE_SPZ_VERSION,
+    spz_version: int = SPZ_INSIDE,
 ) -> list[int]:
     """Write levels of detail as 3D Tiles of glTF with SPZ, for CesiumJS: all of them, or nothing.
 
