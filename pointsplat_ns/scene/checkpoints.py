@@ -1,4 +1,5 @@
-"""Reads checkpoints of Splatfacto (``step-*.ckpt``) and gsplat (``ckpts/ckpt_*_rank0.pt``)."""
+"""Reads checkpoints of Splatfacto (``step-*.ckpt``), gsplat (``ckpts/ckpt_*_rank0.pt``) and 3DGS
+(``chkpnt*.pth``)."""
 
 from __future__ import annotations
 
@@ -18,35 +19,83 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.scene.checkpoint_pickles import PickleRefused, need_bounded
 from pointsplat_ns.scene.gaussians import PARAMETERS, Gaussians
-from pointsplat_ns.system.files import one_line, read_text, require_file, require_memory
+from pointsplat_ns.scene.moving import refuse_moving
+from pointsplat_ns.system.files import (
+    logger,
+    one_line,
+    read_text,
+    require_file,
+    require_memory,
+)
 from pointsplat_ns.system.opening import open_regular
 
-EXPECTED = "expected a checkpoint that Splatfacto or gsplat saved"
+EXPECTED = "expected a checkpoint that Splatfacto, gsplat or 3DGS saved"
+
+_INRIA_ENTRIES = 12
+"""Entries of the model in a checkpoint of 3DGS: SH degree, six parameters, three statistics, the
+optimiser, and the scale of learning rates."""
 
 
 def read_checkpoint(path: Path | str) -> Gaussians:
-    """Read the scene of a checkpoint of Splatfacto or gsplat's trainer.
+    """Read the scene of a checkpoint of Splatfacto, of gsplat's trainer, or of INRIA's 3DGS.
 
     Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, Splatfacto
     stores colours as logits; they are converted to SH coefficients of the same colour. For gsplat,
-    the training's ``cfg.yml`` decides whether the scene is antialiased.
+    the training's ``cfg.yml`` decides whether the scene is antialiased, and the parts of a training
+    on several GPUs are joined, whichever is named.
 
     Returns:
         The scene, float32 on the CPU, in the training's frame: for Splatfacto, the frame of the
         run's dataparser.
 
     Raises:
-        SceneError: if the file is truncated, is not a checkpoint, belongs to another method, or is
-            one of several parts.
+        SceneError: if the file is truncated, is not a checkpoint, belongs to another method or a
+            moving scene, or is one of several parts of which others are missing.
     """
     path = require_file(path, "a checkpoint")
-    named = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)
-    if named is not None and path.with_name(f"{named[1]}1.pt").exists():
-        raise SceneError(
-            f"{path}: one part of a multi-GPU training; expected the whole scene; export a PLY "
-            "with --save_ply"
+    parts = checkpoint_parts(path)
+    if len(parts) > 1:
+        logger.info(
+            "%s: one of %d parts of a training on several GPUs, which are joined", path, len(parts)
         )
+        return _joined([_read_part(part) for part in parts], path)
+    return _read_part(path)
+
+
+def checkpoint_parts(path: Path) -> list[Path]:
+    """All files of a checkpoint of gsplat: of a training on several GPUs one per GPU. Raises
+    SceneError if one of them is missing."""
+    named = re.fullmatch(r"(ckpt_\d+_rank)(\d{1,4})\.pt", path.name)
+    if named is None:
+        return [path]
+    ranks = {int(named[2])}
+    for other in path.parent.glob(f"{named[1]}*.pt"):
+        if rank := re.fullmatch(r"(\d{1,4})\.pt", other.name.removeprefix(named[1])):
+            ranks.add(int(rank[1]))
+    parts = [path.with_name(f"{named[1]}{rank}.pt") for rank in range(max(ranks) + 1)]
+    missing = [part.name for part in parts if not part.is_file()]
+    if missing:
+        raise SceneError(
+            f"{path}: one of at least {len(parts)} parts of a training on several GPUs; expected "
+            f"all of them beside it; {missing[0]} is missing"
+        )
+    return parts
+
+
+def _joined(parts: list[Gaussians], path: Path) -> Gaussians:
+    degrees = {part.sh_degree for part in parts}
+    if len(degrees) > 1:
+        raise SceneError(
+            f"{path}: the parts of its training have SH of degrees {sorted(degrees)}; expected one"
+        )
+    return Gaussians.cat(parts)
+
+
+def _read_part(path: Path) -> Gaussians:
+    """The scene of one file."""
     content = load_checkpoint(path)
+    if isinstance(content, tuple) and len(content) == 2 and isinstance(content[0], tuple):
+        return _scene_of_inria(content[0], path)
     # gsplat's simple_trainer
     if isinstance(content, dict) and isinstance(content.get("splats"), dict):
         scene = _scene_of_gsplat(content["splats"], path)
@@ -81,6 +130,7 @@ def _gsplat_antialiased(path: Path) -> bool:
 
 def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
     """The scene of gsplat's parameters: opacities (N,), constant SH coefficients (N, 1, 3)."""
+    refuse_moving((key for key in splats if isinstance(key, str)), path)
     keys = dict(zip(PARAMETERS, PARAMETERS, strict=True)) | {
         "features_dc": "sh0",
         "features_rest": "shN",
@@ -91,6 +141,33 @@ def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
     if isinstance(dc := held["features_dc"], Tensor) and dc.dim() == 3 and dc.shape[1] == 1:
         held["features_dc"] = dc[:, 0]
     return _scene_of({name: (key, held[name]) for name, key in keys.items()}, path)
+
+
+def _scene_of_inria(model: tuple[Any, ...], path: Path) -> Gaussians:
+    """The scene of what 3DGS and its relatives save: the SH degree, positions, constant (N, 1, 3)
+    and other (N, K, 3) SH coefficients, log-scales, of 2DGS (N, 2), quaternions, opacity logits.
+
+    4DGaussians has the state of its deformation among them, and 4D Gaussian Splatting times behind
+    them.
+    """
+    if any(isinstance(entry, dict) for entry in model[:7]) or len(model) > _INRIA_ENTRIES + 2:
+        raise SceneError(
+            f"{path}: a checkpoint of a moving scene; export a PLY of one moment from the program "
+            "that trained it"
+        )
+    if len(model) != _INRIA_ENTRIES:
+        raise SceneError(
+            f"{path}: a checkpoint of {len(model)} entries; expected {_INRIA_ENTRIES}, as 3DGS "
+            "saves; name the point_cloud.ply of the training instead"
+        )
+    names = ("means", "features_dc", "features_rest", "scales", "quats", "opacities")
+    held = dict(zip(names, model[1:7], strict=True))
+    dc, scales = held["features_dc"], held["scales"]
+    if isinstance(dc, Tensor) and dc.dim() == 3 and dc.shape[1] == 1:
+        held["features_dc"] = dc[:, 0]
+    if _is_dense(scales) and scales.dim() == 2 and scales.shape[1] == 2:
+        held["scales"] = torch.nn.functional.pad(scales.detach(), (0, 1), value=-torch.inf)
+    return _scene_of({name: (name, held[name]) for name in PARAMETERS}, path)
 
 
 def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
@@ -184,14 +261,15 @@ def is_complete(path: Path) -> bool:
 def allow_splatfacto_checkpoints() -> None:
     """Allow numpy's float64 scalars in torch's ``weights_only`` loader.
 
-    Splatfacto checkpoints hold such a scalar in the state of their schedulers. The registered
-    functions rebuild it from its bytes; they cannot run code from the file.
+    Splatfacto checkpoints hold such a scalar in the state of their schedulers, and those of 3DGS
+    one as scale of learning rates, also as float32. The registered functions rebuild it from its
+    bytes; they cannot run code from the file.
     """
     # numpy 2 renamed the module.
     scalar = importlib.import_module(
         f"numpy.{'_core' if hasattr(np, '_core') else 'core'}.multiarray"
     ).scalar
-    allowed: list[Any] = [np.dtype, type(np.dtype(np.float64))]
+    allowed: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
     # A checkpoint may come from the other major version of numpy, so register the function under
     # both names.
     allowed += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
@@ -236,7 +314,7 @@ def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
         found = _some(content, 6) if isinstance(content, dict) else type(content).__name__
         raise SceneError(
             f"{path}: not a checkpoint of a scene; found {found}; expected the key 'pipeline' of "
-            "nerfstudio, or 'splats' of gsplat"
+            "nerfstudio, or 'splats' of gsplat, or the tuple of 3DGS"
         )
     return state
 

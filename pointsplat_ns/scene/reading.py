@@ -33,8 +33,8 @@ from pointsplat_ns.system.outputs import claim, outputs_claimed
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
 SCENE_KINDS = (
-    f"a scene ({READABLE}), a checkpoint of Splatfacto or gsplat (.ckpt, .pt), or a Splatfacto run "
-    "(its folder or config.yml)"
+    f"a scene ({READABLE}), a checkpoint of Splatfacto, gsplat or 3DGS (.ckpt, .pt, .pth), or a "
+    "Splatfacto run (its folder or config.yml)"
 )
 
 
@@ -223,7 +223,8 @@ class SourceFile(NamedTuple):
     """The file that a dense scene was read from."""
 
     name: str
-    """For a folder of SOG, streamed or not, or of 3D Tiles, that folder."""
+    """For a folder of SOG, streamed or not, or of 3D Tiles, that folder; for a checkpoint in parts,
+    the one named."""
     bytes: int
     """Total of all files of a folder."""
     sha256: str
@@ -243,15 +244,17 @@ def source_file(path: Path | str) -> SourceFile:
         lines = (
             f"{part.relative_to(folder).as_posix()} {digest}\n" for part, digest in hashes.items()
         )
-        name = name if is_scene_file(path) else folder.resolve().name
+        is_file = is_scene_file(path) or Path(path).suffix == ".pt"
+        name = Path(path).name if is_file else folder.resolve().name
         digest = hashlib.sha256("".join(lines).encode()).hexdigest()
     return SourceFile(name, size, digest)
 
 
 def source_parts(path: Path | str) -> list[Path]:
     """The files of a scene: all of a SOG folder, by name, streamed or not; of 3D Tiles, a ``.gltf``
-    or ``.rad``, the file and those that it names; the checkpoint of a run; or one file. Raises
-    SceneError if a run has no checkpoint, or a folder cannot be read."""
+    or ``.rad``, the file and those that it names; the checkpoint of a run; all parts of a
+    checkpoint; or one file. Raises SceneError if a run has no checkpoint, a part is missing, or a
+    folder cannot be read."""
     path = Path(path)
     folder = path.parent if path.name in (SOG_META, STREAM_META) else path
     streamed = path.name != SOG_META and (folder / STREAM_META).is_file()

@@ -12,12 +12,13 @@ import pytest
 import torch
 from refusing import fails as refused
 
+import pointsplat_ns as ps
 from making import Bomb, normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.scene.checkpoints import read_checkpoint
 from pointsplat_ns.scene.inert_yaml import Tagged, read_config
-from pointsplat_ns.scene.reading import kind_of, read_scene
+from pointsplat_ns.scene.reading import kind_of, read_scene, source_file
 
 
 def fails(path, *fragments):
@@ -123,7 +124,7 @@ OTHER_METHOD = {
     ("content", "found"),
     [
         *(
-            (some, ["expected a checkpoint that Splatfacto or gsplat saved"])
+            (some, ["expected a checkpoint that Splatfacto, gsplat or 3DGS saved"])
             for some in (b"", b"hello", b"PK", bytes(5000), b"\x80\x02}q\x00.")
         ),
         (
@@ -231,12 +232,108 @@ def test_settings_of_a_gsplat_training_tell_whether_it_is_antialiased(tmp_path, 
     assert read_scene(path).antialiased == (settings == "antialiased: true\n")
 
 
-def test_a_part_of_a_training_on_several_gpus_is_refused(tmp_path):
-    for name in ("ckpt_9_rank0.pt", "ckpt_9_rank1.pt", "ckpt_8_rank0.pt"):
-        torch.save({"step": 9, "splats": splats_of(GOOD)}, tmp_path / name)
-    for name in ("ckpt_9_rank0.pt", "ckpt_9_rank1.pt"):
-        fails(tmp_path / name, "one part of a multi-GPU training", "--save_ply")
+def test_parts_of_a_training_on_several_gpus_are_joined(tmp_path, caplog):
+    whole = normal_scene(12, 1)
+    for rank in range(3):  # gsplat gives every third point to each of three
+        part = {"step": 9, "splats": splats_of(whole[rank::3])}
+        torch.save(part, tmp_path / f"ckpt_9_rank{rank}.pt")
+    torch.save({"step": 8, "splats": splats_of(GOOD)}, tmp_path / "ckpt_8_rank0.pt")
+    joined = ps.Gaussians.cat([whole[rank::3] for rank in range(3)])
+    sources = set()
+    for rank in range(3):
+        path = tmp_path / f"ckpt_9_rank{rank}.pt"
+        with caplog.at_level(logging.INFO):
+            assert same_bits(read_scene(path), joined)
+        assert f"{path}: one of 3 parts of a training on several GPUs" in caplog.text
+        source = source_file(path)
+        assert source.name == path.name and source.bytes > 2 * path.stat().st_size
+        sources.add(source.sha256)
+    assert len(sources) == 1
     assert same_bits(read_scene(tmp_path / "ckpt_8_rank0.pt"), GOOD)
+
+
+@pytest.mark.parametrize(("there", "missing"), [((1,), 0), ((0, 2), 1), ((0, 1, 3), 2)])
+def test_a_part_of_a_training_whose_others_are_missing_is_no_scene(tmp_path, there, missing):
+    for rank in there:
+        torch.save({"step": 9, "splats": splats_of(GOOD)}, tmp_path / f"ckpt_9_rank{rank}.pt")
+    for rank in there:
+        fails(
+            tmp_path / f"ckpt_9_rank{rank}.pt",
+            f"parts of a training on several GPUs; expected all of them beside it; "
+            f"ckpt_9_rank{missing}.pt is missing",
+        )
+
+
+def test_parts_of_different_sh_degrees_are_no_scene(tmp_path):
+    for rank in range(2):
+        part = {"step": 9, "splats": splats_of(normal_scene(3, rank))}
+        torch.save(part, tmp_path / f"ckpt_9_rank{rank}.pt")
+    fails(tmp_path / "ckpt_9_rank0.pt", "SH of degrees [0, 1]")
+
+
+def saved_by_inria(scene, scales=None, scale_of_rates=4.5):
+    """What 3DGS saves as ``chkpnt30000.pth``: its model as a tuple, and the step."""
+    parameters = {
+        "xyz": scene.means,
+        "f_dc": scene.features_dc[:, None],
+        "f_rest": scene.features_rest,
+        "scaling": scene.scales if scales is None else scales,
+        "rotation": scene.quats,
+        "opacity": scene.opacities,
+    }
+    held = {name: torch.nn.Parameter(value.clone()) for name, value in parameters.items()}
+    groups = [{"params": [value], "lr": 0.1, "name": name} for name, value in held.items()]
+    optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
+    for value in held.values():
+        value.grad = torch.ones_like(value)
+    optimizer.step()
+    before = [value.detach().clone() for value in parameters.values()]
+    for value, old in zip(held.values(), before, strict=True):
+        value.data = old
+    n = len(scene)
+    statistics = torch.zeros(n), torch.zeros(n, 1), torch.zeros(n, 1)
+    degree = scene.sh_degree
+    return (degree, *held.values(), *statistics, optimizer.state_dict(), scale_of_rates), 30_000
+
+
+@pytest.mark.parametrize("scale", [4.5, np.float32(4.5), np.float64(4.5)], ids=repr)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_checkpoint_of_3dgs_is_read_to_the_bit(tmp_path, degree, scale):
+    scene = normal_scene(7, degree)
+    path = tmp_path / "chkpnt30000.pth"
+    torch.save(saved_by_inria(scene, scale_of_rates=scale), path)
+    assert same_bits(read_scene(path), scene) and kind_of(path) == "checkpoint"
+
+
+def test_discs_in_a_checkpoint_of_2dgs_are_flat(tmp_path):
+    path = tmp_path / "chkpnt7.pth"
+    torch.save(saved_by_inria(GOOD, GOOD.scales[:, :2]), path)
+    found = read_scene(path)
+    assert torch.equal(found.scales[:, :2], GOOD.scales[:, :2])
+    assert float(found.stds[:, 2].max()) < 1e-30
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda model: (*model[:2], {"a": torch.zeros(1)}, *model[2:]), "of a moving scene"),
+        (lambda model: (*model, torch.zeros(4, 1), torch.zeros(4, 1), None), "of a moving scene"),
+        (lambda model: model[:9], "a checkpoint of 9 entries; expected 12"),
+        (lambda model: (model[0], None, *model[2:]), "lacks the key 'means'"),
+        (lambda model: (*model[:2], model[2][:, 0, :2], *model[3:]), "features_dc has shape"),
+    ],
+    ids=range(5),
+)
+def test_a_checkpoint_of_a_relative_of_3dgs_is_refused_by_what_it_is(tmp_path, change, said):
+    model, step = saved_by_inria(GOOD)
+    torch.save((change(model), step), tmp_path / "chkpnt7.pth")
+    fails(tmp_path / "chkpnt7.pth", said)
+
+
+@pytest.mark.parametrize("key", ["trbf_center", "motion", "omega", "velocities"])
+def test_a_checkpoint_of_a_moving_scene_is_refused(tmp_path, key):
+    torch.save({"step": 1, "splats": {**splats_of(GOOD), key: torch.zeros(4)}}, tmp_path / "a.pt")
+    fails(tmp_path / "a.pt", "a moving scene", f"{key!r}", "one moment")
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ The files in ``cases`` were made from the example room, in the form that the nam
 
 import io
 import json
+import math
 import pickle
 import zipfile
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from plys import columns_of, write_columns
 from refusing import fails
 
@@ -256,3 +258,64 @@ def test_a_direction_along_no_axis_is_used_and_turns_with_the_scene(tmp_path):
     assert turned.up == "-y", "what is said to be up by name is so"
     with pytest.raises(ps.SceneError, match="or three numbers"):
         scene.replace(up=(0.0, 0.0, 0.0))
+
+
+def blender(folder: Path, sizes: dict[str, tuple[int, int]], **extra: object) -> Path:
+    """A scene of Blender for NeRF: photos without suffix in the file, and no size of them."""
+    for name, size in sizes.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGBA", size).save(folder / f"{name}.png")
+    frames = [
+        {"file_path": f"./{name}", "rotation": 0.01, "transform_matrix": torch.eye(4).tolist()}
+        for name in sizes
+    ]
+    path = folder / "transforms_train.json"
+    path.write_text(json.dumps({"camera_angle_x": 0.69, "frames": frames, **extra}))
+    return path
+
+
+def test_sizes_that_a_camera_file_lacks_are_those_of_the_photos(tmp_path):
+    path = blender(tmp_path, {"train/r_0": (80, 60), "train/r_1": (80, 60), "train/r_2": (40, 60)})
+    found = read_named_views(path)
+    assert [camera.size for camera in found.cameras] == [(80, 60), (80, 60), (40, 60)]
+    focals = [camera.focal[0] for camera in found.cameras]
+    assert focals == pytest.approx([0.5 * side / math.tan(0.345) for side in (80, 80, 40)])
+    assert found.photo(2) == tmp_path / "train/r_2.png"
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda folder: (folder / "train/r_0.png").unlink(), "is not beside the file"),
+        (lambda folder: (folder / "train/r_0.png").write_bytes(b"%!PS"), "cannot be read (not one"),
+    ],
+)
+def test_a_camera_without_a_size_and_a_photo_is_refused(tmp_path, make, said):
+    path = blender(tmp_path, {"train/r_0": (8, 6)})
+    make(tmp_path)
+    fails(
+        lambda: read_named_views(path),
+        f"{path}: camera 0 has no size, and its photo './train/r_0' {said}",
+    )
+
+
+def test_photos_outside_of_the_folder_are_not_opened_for_their_size(tmp_path):
+    path = blender(tmp_path / "data", {"r_0": (8, 6)})
+    Image.new("RGB", (8, 6)).save(tmp_path / "other.png")
+    content = json.loads(path.read_text())
+    content["frames"][0]["file_path"] = "../other.png"
+    path.write_text(json.dumps(content))
+    fails(lambda: read_named_views(path), "'../other.png' is not beside the file")
+
+
+def test_poses_that_ns_export_writes_are_refused_with_what_to_name_instead(tmp_path):
+    """They have no focal lengths."""
+    path = tmp_path / "transforms_train.json"
+    frames = [{"file_path": "images/0.png", "transform": torch.eye(4)[:3].tolist()}]
+    path.write_text(json.dumps(frames))
+    fails(
+        lambda: read_named_views(path),
+        f"{path}: poses of `ns-export cameras`",
+        "the run itself",
+        "dataparser_transforms.json",
+    )

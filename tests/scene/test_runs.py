@@ -104,7 +104,7 @@ def test_other_methods_are_passed_over_and_said_where_nothing_is_left(make_run, 
 
 
 def test_anything_else_is_refused_with_what_is_accepted(tmp_path):
-    accepted = "tileset.json), a checkpoint of Splatfacto or gsplat (.ckpt, .pt)"
+    accepted = "tileset.json), a checkpoint of Splatfacto, gsplat or 3DGS (.ckpt, .pt, .pth)"
     (tmp_path / "scene.obj").write_bytes(b"")
     fails(
         lambda: read_scene(tmp_path / "scene.obj"), tmp_path / "scene.obj", "a .obj file", accepted

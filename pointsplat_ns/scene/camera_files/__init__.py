@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.scene.camera_files.camera_views import (
@@ -17,11 +16,16 @@ from pointsplat_ns.scene.camera_files.camera_views import (
     CameraFile,
     Motion,
     checked_views,
+    photo_file,
     photo_order,
     rigid,
 )
 from pointsplat_ns.scene.camera_files.colmap import colmap_cameras, model_folder
-from pointsplat_ns.scene.camera_files.json_cameras import inria_cameras, nerfstudio_cameras
+from pointsplat_ns.scene.camera_files.json_cameras import (
+    inria_cameras,
+    nerfstudio_cameras,
+    photo_folders,
+)
 from pointsplat_ns.scene.formats import SOG_META, STREAM_META, format_named
 from pointsplat_ns.scene.runs import RUN_FILES, may_be_run, read_transforms
 from pointsplat_ns.scene.views import Views
@@ -61,16 +65,7 @@ class NamedViews:
 
     def photo(self, index: int) -> Path | None:
         """The photo of a view; None if it is not in or below one of the folders."""
-        relative = PurePosixPath(self.names[index] if "\0" not in self.names[index] else "")
-        # never opens files outside of the folders
-        if not relative.name or relative.is_absolute() or ".." in relative.parts:
-            return None
-        found = (
-            folder / f"{relative}{suffix}" for folder in self.folders for suffix in ("", ".png")
-        )
-        with suppress(OSError):
-            return next((file for file in found if file.is_file()), None)
-        return None
+        return photo_file(self.folders, self.names[index])
 
 
 def is_camera_file(path: Path | str) -> bool:
@@ -143,7 +138,7 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
         logger.info(
             "%s: the lens distortion of %d of %d cameras is ignored", path, bent, len(found.cameras)
         )
-    folders = [path.parent, path.absolute().parent.parent / "resized_images"]
+    folders = photo_folders(path)
     if model is not None:
         folders = [above / "images" for above in (model, *model.absolute().parents[:3])]
     motion = None
@@ -183,6 +178,12 @@ def _json_cameras(path: Path) -> CameraFile:
             f"{path}: cannot be read as JSON ({one_line(error, 80)}); expected {CAMERA_KINDS}"
         ) from error
     if isinstance(content, list):
+        if content and isinstance(content[0], dict) and "transform" in content[0]:
+            raise DataError(
+                f"{path}: poses of `ns-export cameras`, without sizes and focal lengths; name the "
+                "run itself, or the transforms.json or COLMAP project of its data with the run's "
+                f"{RUN_FILES.transforms} beside it"
+            )
         return inria_cameras(content, path)
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         return nerfstudio_cameras(content, path)

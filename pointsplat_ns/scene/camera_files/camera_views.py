@@ -6,8 +6,9 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import torch
@@ -188,6 +189,18 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None) 
     Ks[:, [0, 1], [0, 1]] = focals * stretch
     Ks[:, :2, 2] = centres * stretch
     return Views(invert_rigid(poses), Ks, width, height, torch.zeros(3, **FLOATS))
+
+
+def photo_file(folders: Sequence[Path], name: str) -> Path | None:
+    """The photo of a name in or below one of the folders, also without its suffix ``.png``; None if
+    there is none. Never leaves the folders."""
+    relative = PurePosixPath(name if "\0" not in name else "")
+    if not relative.name or relative.is_absolute() or ".." in relative.parts:
+        return None
+    found = (folder / f"{relative}{suffix}" for folder in folders for suffix in ("", ".png"))
+    with suppress(OSError):
+        return next((file for file in found if file.is_file()), None)
+    return None
 
 
 def photo_order(names: Sequence[str]) -> list[int]:

@@ -3,7 +3,8 @@
 ``transforms.json`` is nerfstudio's and instant-ngp's format. Each of its ``frames`` has a
 ``transform_matrix``, camera to world, OpenGL axes (x right, y up, z back). ``fl_x``, ``fl_y``,
 ``cx``, ``cy``, ``w``, ``h`` and the distortion are given per frame or once for all frames;
-``camera_angle_x``, the horizontal field of view in radians, may replace focal lengths.
+``camera_angle_x``, the horizontal field of view in radians, may replace focal lengths. Without
+``w`` and ``h``, as in scenes of Blender for NeRF, the photo's header gives the size.
 ``applied_transform`` (3 x 4) and ``applied_scale`` are the transform from the world of the original
 photos to that of the file.
 
@@ -29,8 +30,11 @@ from pointsplat_ns.scene.camera_files.camera_views import (
     finite,
     matrix,
     need_count,
+    photo_file,
     rigid,
 )
+from pointsplat_ns.scene.image_files import IMAGE_ERRORS, open_image
+from pointsplat_ns.system.files import one_line
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
@@ -88,10 +92,14 @@ def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path)
         raise DataError(
             f"{path}: camera {index} is {str(kind)[:40]!r}; expected one of {', '.join(lenses)}"
         )
+    name, mask = (
+        text if isinstance(text, str) else ""
+        for text in (frame.get("file_path"), frame.get("mask_path"))
+    )
     width = finite(said["w"])
     height = finite(said["h"])
     if width is None or height is None:
-        raise DataError(f"{path}: camera {index} has no size; expected numbers 'w' and 'h', pixels")
+        width, height = _size_of_photo(name, index, path)
     fx = finite(said["fl_x"]) or _focal(width, finite(said["camera_angle_x"]))
     fy = finite(said["fl_y"]) or _focal(height, finite(said["camera_angle_y"])) or fx
     if fx is None or fy is None:
@@ -106,10 +114,6 @@ def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path)
         raise DataError(
             f"{path}: camera {index} has no pose; expected 'transform_matrix', 4 x 4 numbers"
         )
-    name, mask = (
-        text if isinstance(text, str) else ""
-        for text in (frame.get("file_path"), frame.get("mask_path"))
-    )
     fisheye = kind in ("OPENCV_FISHEYE", "FISHEYE")
     model = (
         "OPENCV_FISHEYE"
@@ -128,6 +132,28 @@ def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path)
         model,
         tuple(finite(said[name]) or 0.0 for name in order),
         mask,
+    )
+
+
+def photo_folders(path: Path) -> list[Path]:
+    """Folders searched for the photos of a JSON file: its own, and ScanNet++'s."""
+    return [path.parent, path.absolute().parent.parent / "resized_images"]
+
+
+def _size_of_photo(name: str, index: int, path: Path) -> tuple[float, float]:
+    """Width and height in the header of a camera's photo, pixels."""
+    photo = photo_file(photo_folders(path), name)
+    found = f"its photo {name[:60]!r} is not beside the file"
+    if photo is not None:
+        try:
+            with open_image(photo) as image:
+                width, height = image.size
+                return float(width), float(height)
+        except IMAGE_ERRORS as error:
+            found = f"its photo {name[:60]!r} cannot be read ({one_line(error, 60)})"
+    raise DataError(
+        f"{path}: camera {index} has no size, and {found}; expected numbers 'w' and 'h', pixels, "
+        "or the photo"
     )
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.scene.checkpoints import read_checkpoint
+from pointsplat_ns.scene.checkpoints import checkpoint_parts, read_checkpoint
 from pointsplat_ns.scene.formats import gltf, sog, splat, spz
 from pointsplat_ns.scene.formats.capacity import Capacity
 from pointsplat_ns.scene.formats.compressed_ply import is_compressed, read_compressed_ply
@@ -137,6 +137,7 @@ FORMATS = (
         read_checkpoint,
         starts=(b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P",),
         zip_member="data.pkl",
+        parts=checkpoint_parts,
     ),
     Format(
         "streamed SOG",
