@@ -52,6 +52,14 @@ def is_direction(up: Any) -> bool:
     )
 
 
+def up_in_json(value: Any) -> str | Direction | None:
+    """The up direction that a value of a JSON file gives: the name of an axis, or a list of three
+    numbers; None if it is neither."""
+    if isinstance(value, list):
+        value = tuple(value)
+    return value if (isinstance(value, str) and value in AXES) or is_direction(value) else None
+
+
 Offset = tuple[float, float, float]
 """Origin of a scene in the frame of its file, scene units."""
 
@@ -177,7 +185,7 @@ class Gaussians:
                 )
         if not self.means.dtype.is_floating_point:
             raise SceneError(f"parameters are {self.means.dtype}; expected a floating-point type")
-        if not (self.up is None or self.up in AXES or is_direction(self.up)):
+        if self.up is not None and up_in_json(self.up) is None:
             raise SceneError(
                 f"up is {self.up!r}; expected {', '.join(AXES[:-1])} or {AXES[-1]}, or three "
                 "numbers"

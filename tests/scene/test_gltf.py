@@ -88,6 +88,19 @@ def test_traits_come_back_and_viewers_see_y_up(tmp_path, suffix, up):
         assert (matrix[:3, :3] @ direction_of(up).numpy()).tolist() == [0, 1, 0]
 
 
+@pytest.mark.parametrize("suffix", [".glb", ".spz.glb"])
+def test_a_direction_along_no_axis_comes_back_and_viewers_see_it_up(tmp_path, suffix):
+    up = (0.123, 0.456, -0.789)
+    scene = SCENE.replace(up=up)
+    ps.save(scene, tmp_path / f"a{suffix}")
+    back = ps.load(tmp_path / f"a{suffix}")
+    assert back.up == up
+    torch.testing.assert_close(back.means, scene.means, rtol=0, atol=3e-4)
+    content, _ = taken_apart((tmp_path / f"a{suffix}").read_bytes())
+    matrix = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
+    assert matrix[:3, :3] @ direction_of(up).numpy() == pytest.approx([0, 1, 0], abs=1e-12)
+
+
 def test_another_program_sees_the_scene_turned_to_y_up(tmp_path):
     """What is written with the traits left out is read as by others."""
     scene = SCENE.replace(up="-z")

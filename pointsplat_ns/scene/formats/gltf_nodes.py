@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.transforms import (
-    AXES,
+    Direction,
     direction_of,
     quaternions_of,
     rotation_matrices,
@@ -20,7 +20,7 @@ from pointsplat_ns.geometry.transforms import (
 )
 from pointsplat_ns.scene.formats.coding import joined
 from pointsplat_ns.scene.formats.gltf_container import Container, listed, numbers
-from pointsplat_ns.scene.gaussians import Gaussians, Offset
+from pointsplat_ns.scene.gaussians import Gaussians, Offset, up_in_json
 from pointsplat_ns.scene.offsets import offset_for, offset_text
 from pointsplat_ns.scene.rotation import Similarity, turned
 from pointsplat_ns.system.tensors import DOUBLES
@@ -50,20 +50,23 @@ class Node:
     about: dict[str, Any] = field(default_factory=dict)
 
 
-def y_up_from(up: str) -> Tensor:
-    """The rotation (3, 3) float64 that turns an axis to y, exact."""
-    return smallest_turn(direction_of(up), direction_of("y")).round()
+def y_up_from(up: str | Direction) -> Tensor:
+    """The rotation (3, 3) float64 that turns a direction to y, exact for an axis."""
+    turn = smallest_turn(direction_of(up), direction_of("y"))
+    return turn.round() if isinstance(up, str) else turn
 
 
 def node_of(scene: Gaussians) -> dict[str, Any]:
-    """The node of a scene. It turns the declared up axis to y, as glTF has it. Its extras hold the
-    traits that glTF has no place for, so that the file is read back in its own frame."""
+    """The node of a scene. It turns the declared up direction to y, as glTF has it. Its extras hold
+    the traits that glTF has no place for, so that the file is read back in its own frame."""
     up, offset = scene.up, scene.offset
     node: dict[str, Any] = {}
     if up not in (None, "y"):
         matrix = torch.eye(4, **DOUBLES)
         matrix[:3, :3] = y_up_from(up or "y")
-        node["matrix"] = [int(value) for value in matrix.T.flatten().tolist()]
+        node["matrix"] = [
+            int(value) if value.is_integer() else value for value in matrix.T.flatten().tolist()
+        ]
     traits = {"up": up, "antialiased": scene.antialiased, "sh_degree": scene.sh_degree}
     if offset is not None:
         traits["offset"] = offset_text(offset)
@@ -192,12 +195,12 @@ def _stretched(scene: Gaussians, rotation: Tensor, lengths: Tensor) -> Gaussians
     return turned(scaled, rotation)
 
 
-def own_frame(traits: dict[str, Any]) -> tuple[Tensor, str | None, Offset | None]:
-    """The rotation (3, 3) from y up back to the frame of a scene, its up axis, and its offset, from
-    what :func:`node_of` wrote. Raises ValueError if they are damaged."""
-    up = traits.get("up")
-    if up is not None and up not in AXES:
-        raise ValueError(f"up is {up!r}, expected an axis")
+def own_frame(traits: dict[str, Any]) -> tuple[Tensor, str | Direction | None, Offset | None]:
+    """The rotation (3, 3) from y up back to the frame of a scene, its up direction, and its offset,
+    from what :func:`node_of` wrote. Raises ValueError if they are damaged."""
+    up = up_in_json(traits.get("up"))
+    if up is None and traits.get("up") is not None:
+        raise ValueError(f"up is {traits['up']!r}, expected an axis or three numbers")
     offset = None
     if "offset" in traits:
         x, y, z = numbers([float(word) for word in str(traits["offset"]).split()], 3)

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.earth import local_frame
-from pointsplat_ns.geometry.transforms import AXES
+from pointsplat_ns.geometry.transforms import Direction
 from pointsplat_ns.scene.formats.coding import damage_named, file_beside
 from pointsplat_ns.scene.formats.gltf import placed_parts
 from pointsplat_ns.scene.formats.gltf_container import Container, listed, mapping, unquoted
 from pointsplat_ns.scene.formats.gltf_nodes import EXTRAS, Placed, matrix_of, together
-from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.gaussians import Gaussians, up_in_json
 from pointsplat_ns.system.files import logger, read_text, require_file
 from pointsplat_ns.system.tensors import DOUBLES
 
@@ -83,13 +83,12 @@ def _tileset(path: Path) -> dict[str, Any]:
     return tileset
 
 
-def _declared_up(tileset: dict[str, Any]) -> str | None:
-    """The up axis: z, or that of the scene which tiles were written from here."""
+def _declared_up(tileset: dict[str, Any]) -> str | Direction | None:
+    """The up direction: z, or that of the scene which tiles were written from here."""
     asset = mapping(tileset, "asset")
     if asset.get("generator") != "pointsplat-ns":
         return "z"
-    up = mapping(mapping(asset, "extras"), EXTRAS).get("up")
-    return up if up in AXES else None
+    return up_in_json(mapping(mapping(asset, "extras"), EXTRAS).get("up"))
 
 
 def _finest(
