@@ -228,6 +228,10 @@ def made_with(all_weights: Sequence[Weights]) -> str:
     return f"weights {digests} ({'; '.join(words)})"
 
 
+SHIPPED = Path("shipped")
+"""The name of the weights that ship for selections, which commands keep in place of their path."""
+
+
 class Refiners:
     """Weights to choose from: those that ship for selections (``shipped``), files, runs, and the
     newest run of each name at any depth below a folder. Errors are those of
@@ -278,8 +282,6 @@ def _unfit(weights: Weights, own: bool, scene: str) -> str:
 def _trained(path: Path) -> list[Path]:
     """The newest finished training of each name below a folder that is no run itself; or the
     path."""
-    if str(path) == "shipped":
-        return [shipped_refiner("paper")]
     is_run = any((path / name).is_file() for name in (RUN_FILES.config, RUN_FILES.refiner))
     if not path.is_dir() or is_run:
         return [path]
@@ -308,6 +310,7 @@ def _read(path: Path) -> Weights:
         path / RUN_FILES.refiner
     )  # of a finished training; a checkpoint does not name its training scenes
     file = inside if path.is_dir() and inside.is_file() else path
+    file = shipped_refiner("paper") if path == SHIPPED else file
     metadata = read_metadata(file) if file.suffix.lower() == ".safetensors" else {}
     refiner = load_refiner(file)
     more = metadata.get("more_keeps")

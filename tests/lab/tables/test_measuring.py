@@ -197,6 +197,7 @@ def test_of_folders_above_runs_the_newest_of_each_name_counts(weights, tmp_path)
     [one] = Refiners([tmp_path / "outputs" / "a"]).all
     assert one.path == tmp_path / "outputs" / newest[0]
     [shipped] = Refiners([Path("shipped")]).all
+    assert shipped.path == Path("shipped"), "commands are the same on every machine"
     assert shipped.network == WAYS.pointsplat.network and "room35" not in shipped.trained_on
 
 
