@@ -127,6 +127,10 @@ REFUSED = {
     ),
     "x.lcc": (b"{}", "LCC files are not read; convert it"),
     "x.ksplat": (bytes(9000), "ksplat files are not read; convert it to .ply or .sog"),
+    "x.splatv": (
+        bytes(64),
+        "moving scene (splatv) files are not read; export a .ply of one moment",
+    ),
     "x.spz": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0", "Git LFS pointer"),
     "y.ply": (b"<!DOCTYPE html><html>", "web page"),
     "y.splat": (b"LASF" + bytes(60), "LAS point cloud"),

@@ -18,8 +18,9 @@ from plys import columns_of, write_columns
 from refusing import fails
 
 import pointsplat_ns as ps
-from making import cloud, same_bits
+from making import SHARED_DATA, cloud, same_bits
 from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.scene.activated import activated_in
 from pointsplat_ns.scene.camera_files import read_named_views
 from pointsplat_ns.scene.formats.sog import encode_sog
 from pointsplat_ns.scene.ply import PlyRows
@@ -186,6 +187,22 @@ def test_ordinary_scenes_are_not_taken_for_activated_ones(name, tmp_path, caplog
     scene = ORDINARY[name]()
     ps.save(scene, tmp_path / "a.ply")
     assert same_bits(ps.load(tmp_path / "a.ply"), scene) and "activated" not in caplog.text
+
+
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the files are not there")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "splats/apt_bathroom/Toilet.compressed.ply",
+        "splats/pc_statue_massa/massa.sog",
+        "splats/kettle_pod/pod.spz",
+        "splatfacto/fox/splatfacto/2026-11-26_gsplat",
+    ],
+)
+def test_trained_scenes_are_not_taken_for_activated_ones(name):
+    scene = ps.load(SHARED_DATA / name)
+    columns = (scene.means, scene.scales, scene.opacities[:, 0])
+    assert not any(activated_in(*(column.double().numpy() for column in columns), len(scene)))
 
 
 @pytest.mark.parametrize(

@@ -152,6 +152,20 @@ def test_a_declared_axis_that_the_scene_contradicts_is_doubted_once(make, right,
     assert (found.up_instead, found.up_text) == (right, str(up))
 
 
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the files are not there")
+@pytest.mark.parametrize(
+    ("name", "axis"),
+    [
+        ("mujoco_tabletop/scene.spz", "y"),
+        ("apt_bathroom/Toilet.compressed.ply", "-y"),
+        ("pc_statue_massa/massa.sog", "-y"),
+    ],
+)
+def test_true_axes_of_published_scenes_are_not_doubted(name, axis):
+    scene = read_scene(SHARED_DATA / "splats" / name).replace(up=axis)
+    assert str(Sampler(scene).up) == axis
+
+
 def test_a_room_is_first_seen_from_inside_and_then_from_other_sides():
     scene = thinned(example_room(), 6000)
     found = opening_views(scene, 4)

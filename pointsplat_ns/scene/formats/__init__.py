@@ -187,6 +187,7 @@ FORMATS = (
     ),
     Format("zip of a PLY", "", zip_member="*.ply", instead="unpack it and name the PLY"),
     Format("ksplat", ".ksplat", instead=_CONVERT),
+    Format("moving scene (splatv)", ".splatv", instead="export a .ply of one moment"),
     Format("LCC", ".lcc", instead=_CONVERT),
     Format("LCC", ".lcc2", instead=_CONVERT),
     Format("Postshot project", ".psht", instead=_EXPORT),
