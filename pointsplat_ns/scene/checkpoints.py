@@ -253,7 +253,8 @@ def read_training_state(path: Path) -> dict[str, Any]:
 def is_complete(path: Path) -> bool:
     """Whether a checkpoint's archive is complete: its directory, at the end, can be read."""
     try:
-        return path.is_file() and zipfile.is_zipfile(path)
+        with open_regular(path) as stream:
+            return zipfile.is_zipfile(stream)
     except (OSError, zipfile.BadZipFile):  # an archive in several parts
         return False
 

@@ -21,6 +21,7 @@ from pointsplat_ns.scene.ply_header import read_header
 from pointsplat_ns.scene.reading import is_folder_of_scenes, is_scene_file
 from pointsplat_ns.scene.runs import RUN_FILES, Run, is_refiner_method, open_run, scene_name
 from pointsplat_ns.system.files import file_stem, logger
+from pointsplat_ns.system.opening import open_regular
 
 Supervision = Literal["auto", "photos", "dense"]
 """Training targets: the run's photos, or renders of the scene before pruning."""
@@ -248,7 +249,7 @@ def _why_none(path: Path) -> str:
             return ""
     except SceneError:
         return ""
-    with suppress(SceneError, OSError), path.open("rb") as stream:
+    with suppress(SceneError, OSError), open_regular(path) as stream:
         for element in read_header(stream, path).elements:
             if {"opacity", "scale_0", "rot_0"} <= {name for name, _ in element.properties}:
                 return ""

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.system.files import one_line, require_file
+from pointsplat_ns.system.files import one_line, read_text, require_file
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def read_config(path: Path | str) -> Tagged:
             f"{path}: {size} bytes; expected a nerfstudio config.yml of at most {most}"
         )
     try:
-        loader = _Loader(path.read_text("utf-8"))
+        loader = _Loader(read_text(path))
         try:
             node = loader.get_single_node()
             if node is not None:

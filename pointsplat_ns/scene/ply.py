@@ -13,6 +13,7 @@ import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -40,6 +41,7 @@ from pointsplat_ns.system.files import (
     require_file,
     require_memory,
 )
+from pointsplat_ns.system.opening import open_regular
 from pointsplat_ns.system.pieces import CHUNK
 
 COLUMNS = {
@@ -101,7 +103,7 @@ class PlyRows:
 
     def __init__(self, path: Path | str, warn: bool = True):
         self.path = path = require_file(path, "a 3DGS PLY file")
-        with failure_named(path, "read"), path.open("rb") as stream:
+        with failure_named(path, "read"), open_regular(path) as stream:
             self._header = header = read_header(stream, path)
         self._vertex = vertex = _gaussian_element(header, path)
         refuse_moving((name for name, _ in vertex.properties), path)
@@ -175,7 +177,7 @@ class PlyRows:
         with (
             np.errstate(over="ignore"),
             failure_named(self.path, "read"),
-            self.path.open("rb") as stream,
+            open_regular(self.path) as stream,
         ):
             for start in range(0, len(rows), at_once):
                 chunk = slice(start, min(start + at_once, len(rows)))
@@ -193,7 +195,7 @@ class PlyRows:
         antialiased, up, offset = self.traits
         return Gaussians(**tensors, antialiased=antialiased, up=up, offset=offset)
 
-    def _rows(self, stream: io.BufferedReader, numbers: Sequence[int]) -> np.ndarray:
+    def _rows(self, stream: BinaryIO, numbers: Sequence[int]) -> np.ndarray:
         """Rows by index. Raises SceneError if the file was truncated meanwhile."""
         together = isinstance(numbers, range) and numbers.step == 1
         parts = [(numbers[0], len(numbers))] if together else [(number, 1) for number in numbers]
@@ -219,7 +221,9 @@ class PlyRows:
 
         require_memory(self.path, 2 * self.path.stat().st_size)
         with failure_named(self.path, "read"):
-            text = self._header.up_to("vertex") + self.path.read_bytes()[self._header.size :]
+            with open_regular(self.path) as stream:
+                stream.seek(self._header.size)
+                text = self._header.up_to("vertex") + stream.read()
         try:
             return PlyData.read(io.BytesIO(text))["vertex"].data
         except (PlyParseError, ValueError, OverflowError) as error:
@@ -230,7 +234,7 @@ class PlyRows:
 
     def _sample(self) -> np.ndarray:
         """About :data:`SAMPLED` rows from all over the file."""
-        with failure_named(self.path, "read"), self.path.open("rb") as stream:
+        with failure_named(self.path, "read"), open_regular(self.path) as stream:
             return self._rows(stream, [*range(0, self.count, max(1, self.count // SAMPLED))])
 
     @functools.cached_property

@@ -29,6 +29,7 @@ from pointsplat_ns.scene.camera_files.camera_views import (
     need_count,
 )
 from pointsplat_ns.system.files import logger, one_line
+from pointsplat_ns.system.opening import open_regular
 from pointsplat_ns.system.tensors import DOUBLES
 
 COLMAP_CAMERAS = {
@@ -101,9 +102,9 @@ def colmap_cameras(path: Path) -> CameraFile:
         (_binary_lenses, _binary_images) if kind == "bin" else (_text_lenses, _text_images)
     )
     try:
-        with cameras_path.open("rb") as stream:
+        with open_regular(cameras_path) as stream:
             lenses = read_lenses(stream, cameras_path)
-        with images_path.open("rb") as stream:
+        with open_regular(images_path) as stream:
             images = list(read_images(stream, images_path))
     except OSError as error:
         raise DataError(
@@ -138,7 +139,7 @@ def colmap_points(path: Path) -> Tensor | None:
         file = folder / f"points3D.{kind}"
         try:
             if file.is_file():
-                with file.open("rb") as stream:
+                with open_regular(file) as stream:
                     points = torch.tensor([*islice(read(stream, file), most + 1)], **DOUBLES).view(
                         -1, 3
                     )

@@ -34,6 +34,7 @@ from pointsplat_ns.scene.gaussians import Gaussians, Traits
 from pointsplat_ns.scene.ply import ply_bytes, read_ply, write_ply
 from pointsplat_ns.scene.ply_header import read_header
 from pointsplat_ns.system.files import failure_named, one_line, replacing
+from pointsplat_ns.system.opening import open_regular
 from pointsplat_ns.system.progress import Progress
 
 
@@ -258,7 +259,7 @@ def format_to_read(path: Path) -> Format | None:
             None,
         )
     with failure_named(path, "read"):
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             start = stream.read(64)
         kind = _told_by_content(path, start) or format_named(path.name)
     if kind is not None and kind.read is None:
@@ -275,7 +276,7 @@ def _told_by_content(path: Path, start: bytes) -> Format | None:
         return format_named(".spz.glb") if gltf.has_spz(path) else kind
     if kind is not None and kind.starts == _PLY:
         compressed, plain = FORMATS[:2]
-        with suppress(SceneError), path.open("rb") as stream:
+        with suppress(SceneError), open_regular(path) as stream:
             return compressed if is_compressed(read_header(stream, path)) else plain
         return plain  # its reader reports the damaged header
     return kind
@@ -287,7 +288,7 @@ def _told_by_zip(path: Path) -> Format | None:
     matches."""
     named = format_named(path.name)
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_regular(path) as stream, zipfile.ZipFile(stream) as archive:
             names = archive.namelist()
     except (zipfile.BadZipFile, NotImplementedError, ValueError, RuntimeError) as error:
         if named is not None and named.zip_member:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import lzma
 import math
+import os
 import struct
 import zipfile
 import zlib
@@ -22,6 +23,7 @@ from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import interleave, spread_bits, zero_as_identity
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.files import one_line, require_memory
+from pointsplat_ns.system.opening import open_regular
 from pointsplat_ns.system.tensors import INDICES
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -65,9 +67,10 @@ def damage_named(path: Path, kind: str) -> Iterator[None]:
 
 
 def load_bytes(path: Path) -> bytes:
-    """The whole content of a file; a SceneError if it does not fit into memory."""
-    require_memory(path, path.stat().st_size)
-    return path.read_bytes()
+    """The whole content of a regular file; a SceneError if it does not fit into memory."""
+    with open_regular(path) as stream:
+        require_memory(path, os.fstat(stream.fileno()).st_size)
+        return stream.read()
 
 
 def file_beside(path: Path, name: Any) -> Path:

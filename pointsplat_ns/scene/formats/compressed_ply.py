@@ -18,6 +18,7 @@ from pointsplat_ns.scene.formats.coding import Array, Blocks
 from pointsplat_ns.scene.gaussians import Gaussians, sh_degree_of
 from pointsplat_ns.scene.ply_header import Element, Header, read_header, traits_of
 from pointsplat_ns.system.files import require_file, require_memory
+from pointsplat_ns.system.opening import open_regular
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = tuple(
@@ -39,7 +40,7 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
     memory."""
     path = require_file(path, "a compressed PLY file")
     with coding.damage_named(path, "compressed PLY"):
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             header = read_header(stream, path)
         count, rest = _checked(header, path)
         require_memory(path, path.stat().st_size + 4 * count * (14 + 3 * rest))

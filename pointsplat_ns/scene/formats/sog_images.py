@@ -6,7 +6,7 @@ import io
 import json
 import zipfile
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.scene.formats.coding import Array
 from pointsplat_ns.scene.image_files import webp_size
 from pointsplat_ns.system.files import require_file, require_memory
+from pointsplat_ns.system.opening import open_regular
 
 SOG_META = "meta.json"
 
@@ -25,16 +26,24 @@ class Images:
     def __init__(self, path: Path):
         self.path = path
         self._zip: zipfile.ZipFile | None = None
+        self._stream: BinaryIO | None = None
         self._folder = path if path.is_dir() else path.parent
         if path.is_dir() or path.name == SOG_META:
             require_file(self._folder / SOG_META, f"{SOG_META} of a SOG folder")
         else:
-            self._zip = zipfile.ZipFile(require_file(path, "a .sog file"))
+            self._stream = open_regular(require_file(path, "a .sog file"))
+            try:
+                self._zip = zipfile.ZipFile(self._stream)
+            except BaseException:
+                self._stream.close()
+                raise
 
     def close(self) -> None:
         """Close the archive."""
         if self._zip is not None:
             self._zip.close()
+        if self._stream is not None:
+            self._stream.close()
 
     @property
     def size(self) -> int:
@@ -102,7 +111,7 @@ class Images:
             size = entries[0].file_size
         if size > most:
             raise SceneError(f"{self.path}: {name} has {size} bytes; expected at most {most}")
-        with part.open("rb") if self._zip is None else self._zip.open(entries[0]) as stream:
+        with open_regular(part) if self._zip is None else self._zip.open(entries[0]) as stream:
             return stream.read(most + 1)  # the declared size may be wrong
 
 

@@ -6,6 +6,7 @@ bytes. The SH degree is 0.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from pointsplat_ns.scene.formats import coding
 from pointsplat_ns.scene.formats.capacity import Capacity, Span
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.files import require_file, require_memory
+from pointsplat_ns.system.opening import open_regular
 from pointsplat_ns.system.progress import Progress, silent
 
 _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -32,11 +34,11 @@ def read_splat(path: Path | str) -> Gaussians:
     Raises SceneError if its size is not a multiple of 32 bytes, it is text, or it does not fit into
     memory."""
     path = require_file(path, "a .splat file")
-    size = path.stat().st_size
+    with coding.damage_named(path, ".splat"), open_regular(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        start = stream.read(4096)
     if size % _ROW.itemsize:
         raise SceneError(f"{path}: {size} bytes; expected {_ROW.itemsize} bytes a Gaussian")
-    with path.open("rb") as stream:
-        start = stream.read(4096)
     if (
         start
         and start.isascii()
@@ -45,7 +47,8 @@ def read_splat(path: Path | str) -> Gaussians:
         raise SceneError(f"{path}: text ({start[:24]!r}...); expected the rows of a .splat file")
     require_memory(path, size + size // _ROW.itemsize * 4 * 14)
     with coding.damage_named(path, ".splat"):
-        rows = np.fromfile(path, _ROW)
+        with open_regular(path) as stream:
+            rows = np.fromfile(stream, _ROW)
         # zero gives -Inf, a flat axis; a negative size gives NaN, which is dropped
         return coding.scene_of(
             rows["means"],
