@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.scene.views import View, Views
     from pointsplat_ns.tools.comparison_plots import plot_comparison
     from pointsplat_ns.tools.filming import open_viewer, render_path
+    from pointsplat_ns.tools.folder_conversion import convert_folder
     from pointsplat_ns.tools.folders import SceneResult, compact_folder
     from pointsplat_ns.tools.levels.levels import Levels
     from pointsplat_ns.tools.loading import load
@@ -88,6 +89,7 @@ _PUBLIC = {
         "PointSplatError",
         "SceneError",
     ),
+    "pointsplat_ns.tools.folder_conversion": ("convert_folder",),
     "pointsplat_ns.tools.folders": ("SceneResult", "compact_folder"),
     "pointsplat_ns.scene.gaussians": ("Gaussians",),
     "pointsplat_ns.scene.reading": ("save",),
@@ -127,6 +129,7 @@ __all__ = [
     "clean",
     "compact",
     "compact_folder",
+    "convert_folder",
     "dataset_views",
     "example_room",
     "info",

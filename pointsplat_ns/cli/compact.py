@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict, replace
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
@@ -13,6 +13,7 @@ import tyro
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import (
+    print_folder,
     print_if_larger,
     print_json,
     print_result,
@@ -25,7 +26,6 @@ from pointsplat_ns.system.terminal import say
 if TYPE_CHECKING:
     from pointsplat_ns.pipeline.quality import Quality
     from pointsplat_ns.pipeline.report import Report
-    from pointsplat_ns.tools.folders import SceneResult
 
 GoalName = Literal["web", "phone", "headset", "email"]
 
@@ -210,7 +210,7 @@ def _compact_folder(
         force=force,
         progress=True,
     )
-    _print_folder(results, folder, [path for path in (html, picture) if path], json_output)
+    print_folder(results, folder, [path for path in (html, picture) if path], json_output)
 
 
 def _write_page(
@@ -274,50 +274,6 @@ def _print_result(report: Report, output: Path, quality: Quality | None) -> None
     print_result(
         report.by, also, report.count_before, report.scene, report.seconds, output, quality
     )
-
-
-def _print_folder(
-    results: list[SceneResult], folder: Path, shown: list[Path], json_output: bool
-) -> None:
-    """Print the results of a folder as a table, or as JSON. Raises PointSplatError if a scene
-    failed."""
-    from pointsplat_ns.errors import PointSplatError
-    from pointsplat_ns.scene.discovery import FOLDER_FILES
-    from pointsplat_ns.scene.formats.spz import version_of
-    from pointsplat_ns.system.terminal import print_table
-    from pointsplat_ns.tools.wording import spz_readers
-
-    done = [result.output for result in results if result.status in ("done", "done before")]
-    failed = sum(result.status == "failed" for result in results)
-    if json_output:
-        print_json({"output": folder, "scenes": [asdict(result) for result in results]})
-    else:
-        forms = (",", ",", ".2f", ".1f", ".1f")
-        rows = []
-        for result in results:
-            numbers = (result.before, result.after, result.megabytes, result.psnr, result.seconds)
-            cells = (
-                "-" if value is None else f"{value:{form}}"
-                for value, form in zip(numbers, forms, strict=True)
-            )
-            remark = result.error or result.note
-            status = f"{result.status}: {remark}" if remark else result.status
-            rows.append((result.name, *cells, status))
-        header = ("scene", "before", "after", "MB", "dB", "seconds", "status")
-        print_table(header, rows, "dB: PSNR against the scene's own renders", left=(0, 6))
-        say(
-            f"{folder}: {len(results) - failed} of {len(results)} scenes, and the table "
-            f"{FOLDER_FILES.scenes_table}"
-        )
-        spz = [file for file in map(Path, done) if file.suffix == ".spz"]
-        if spz:
-            say(spz_readers(version_of(spz[0])))
-        for path in shown:
-            say(f"{path}: all scenes before and after")
-    if failed:
-        raise PointSplatError(
-            f"{failed} of {len(results)} scenes failed; run the same command to retry them"
-        )
 
 
 def _file_text(path: Path) -> str:

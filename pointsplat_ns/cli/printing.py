@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
+from dataclasses import asdict
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.pipeline.quality import Quality
     from pointsplat_ns.scene.gaussians import Gaussians
     from pointsplat_ns.scene.ply import PlyRows
+    from pointsplat_ns.tools.folders import SceneResult
 
 _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
@@ -135,3 +137,63 @@ def written_size(where: Path) -> str:
     from pointsplat_ns.system.files import bytes_text
 
     return bytes_text(where.stat().st_size)
+
+
+def print_folder(
+    results: list[SceneResult],
+    folder: Path,
+    shown: list[Path],
+    json_output: bool,
+    compared: bool = True,
+) -> None:
+    """Print the results of a folder as a table, or as JSON. Raises PointSplatError if a scene
+    failed.
+
+    Args:
+        results: of all scenes.
+        folder: folder of the results.
+        shown: files with pictures of all scenes.
+        json_output: whether to print JSON.
+        compared: whether results are compared with their scenes, in dB.
+    """
+    from pointsplat_ns.errors import PointSplatError
+    from pointsplat_ns.scene.discovery import FOLDER_FILES
+    from pointsplat_ns.system.terminal import print_table
+
+    failed = sum(result.status == "failed" for result in results)
+    if json_output:
+        print_json({"output": folder, "scenes": [asdict(result) for result in results]})
+    else:
+        columns = {"before": ",", "after": ",", "megabytes": ".2f", "psnr": ".1f"}
+        titles = {"megabytes": "MB", "psnr": "dB"}
+        if not compared:
+            columns = {"after": ",", "megabytes_before": ".2f", "megabytes": ".2f"}
+            titles = {"after": "Gaussians", "megabytes_before": "MB before", "megabytes": "MB"}
+        columns["seconds"] = ".1f"
+        rows = []
+        for result in results:
+            numbers = [getattr(result, name) for name in columns]
+            cells = (
+                "-" if value is None else f"{value:{form}}"
+                for value, form in zip(numbers, columns.values(), strict=True)
+            )
+            remark = result.error or result.note
+            status = f"{result.status}: {remark}" if remark else result.status
+            rows.append((result.name, *cells, status))
+        header = ("scene", *(titles.get(name, name) for name in columns), "status")
+        note = "dB: PSNR against the scene's own renders" if compared else ""
+        print_table(header, rows, note, left=(0, len(header) - 1))
+        say(
+            f"{folder}: {len(results) - failed} of {len(results)} scenes, and the table "
+            f"{FOLDER_FILES.scenes_table}"
+        )
+        done = [result.output for result in results if result.status in ("done", "done before")]
+        spz = next((file for file in map(Path, done) if file.suffix == ".spz"), None)
+        if spz is not None:
+            print_readers(spz)
+        for path in shown:
+            say(f"{path}: all scenes before and after")
+    if failed:
+        raise PointSplatError(
+            f"{failed} of {len(results)} scenes failed; run the same command to retry them"
+        )

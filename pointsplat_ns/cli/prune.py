@@ -52,7 +52,8 @@ def prune(
     from pointsplat_ns.scene.ply import PlyRows
     from pointsplat_ns.tools.wording import log_report, quality_details, quality_json
 
-    options.need_one_scene(scene)
+    instead = f"pointsplat compact {scene} --effort instant merges them all"
+    options.need_one_scene(scene, instead)
     options.check_poses(how.poses)
     output = output or options.output_beside(scene, "pruned")
     options.check_outputs(output, force)

@@ -118,15 +118,15 @@ def need_scenes(*paths: Path | None) -> None:
         raise SceneError(f"{', '.join(missing)}: {fault}; expected a scene: {ONE_SCENE}")
 
 
-def need_one_scene(path: Path) -> None:
-    """Raise a SceneError if the path is a folder of scenes."""
+def need_one_scene(path: Path, instead: str = "compact, convert and info accept one") -> None:
+    """Raise a SceneError if the path is a folder of scenes; ``instead`` says what accepts it."""
     from pointsplat_ns.errors import SceneError
     from pointsplat_ns.scene.reading import SCENE_KINDS, is_folder_of_scenes
 
     if is_folder_of_scenes(path):
         raise SceneError(
-            f"{path}: a folder without config.yml, so not a run; expected {SCENE_KINDS}; compact "
-            "and info accept a folder of scenes"
+            f"{path}: a folder without config.yml, so not a run; expected {SCENE_KINDS}; for a "
+            f"folder of scenes: {instead}"
         )
 
 

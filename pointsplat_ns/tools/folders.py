@@ -1,4 +1,5 @@
-"""Compacts every scene of a folder, and writes a table of the results.
+"""Works on every scene of a folder, and writes a table of the results: compacts them, or, in
+:mod:`~pointsplat_ns.tools.folder_conversion`, converts them.
 
 ``room.ply.json`` is the record of the result ``room.ply``. A result is finished if its record
 matches two hashes: of the input file with the options, and of the result itself.
@@ -14,11 +15,11 @@ import json
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 
@@ -32,7 +33,7 @@ from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.rendering.comparison.sizes import size_text
 from pointsplat_ns.scene.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.scene.formats import SPZ_VERSION, format_like
+from pointsplat_ns.scene.formats import SPZ_VERSION, Format, format_like
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene, save_as, source_file, source_parts
 from pointsplat_ns.system.files import (
@@ -208,32 +209,62 @@ def compact_folder(
         "format": target_format,
         "spz_version": spz_version,
     }
-    check_jobs(jobs)
+    work = _Compacting(
+        record=record,
+        drawn=(html, picture) != (None, None),
+        force=force,
+        options=options,
+        refiner=refiner,
+    )
     page, sheet = (None if path is None else Path(path) for path in (html, picture))
+    return work_through(folder, target, work, target_format, jobs, progress, page, sheet)
+
+
+def work_through(
+    folder: Path,
+    target: Path,
+    work: FolderWork,
+    target_format: str | None = None,
+    jobs: int = 1,
+    progress: bool | Progress = False,
+    page: Path | None = None,
+    sheet: Path | None = None,
+) -> list[SceneResult]:
+    """Do the work on every scene of a folder, unless it is finished, and write the table of results
+    to the folder ``target``. Inside of :func:`~pointsplat_ns.system.outputs.outputs_claimed`.
+
+    Args:
+        folder, target, jobs, progress: as for :func:`compact_folder`.
+        work: pickled for other processes.
+        target_format: suffix of all results; by default the format of each scene.
+        page, sheet: as ``html`` and ``picture`` of :func:`compact_folder`.
+
+    Raises:
+        SceneError: as :func:`compact_folder`.
+    """
+    check_jobs(jobs)
     for shown, end in ((page, ".html"), (sheet, ".png")):
         if shown is not None:
             need_suffix(shown, end)
-            need_new(shown, force or (target / FOLDER_FILES.scenes).exists())
+            need_new(shown, work.force or (target / FOLDER_FILES.scenes).exists())
     if os.path.realpath(folder) == os.path.realpath(target):
         raise SceneError(
             f"{target}: contains the scenes themselves; name another folder for the results"
         )
     tasks = [
-        _Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
+        Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
         for name, path in find_scenes(folder).items()
     ]
-    if not force:
+    if not work.force:
         claim(target)
-    _describe(target, record, force)
-    drawn = (page, sheet) != (None, None)
-    work = _Compacting(options=options, refiner=refiner, record=record, drawn=drawn, force=force)
+    _describe(target, work.record, work.force)
     results: dict[str, SceneResult] = {}
     try:
         with progress_bar(progress) as report, Workers(work, jobs) as workers:
-            report("compact", 0.0)
+            report(work.label, 0.0)
             for task, result in workers.results(tasks):
                 results[task.name] = result
-                report("compact", len(results) / len(tasks))
+                report(work.label, len(results) / len(tasks))
                 if result.status == "failed":
                     logger.warning("%s failed: %s", result.name, result.error)
     finally:  # also after an interruption
@@ -250,18 +281,18 @@ def compact_folder(
     return rows
 
 
-def output_folder(folder: Path) -> Path:
+def output_folder(folder: Path, done: str = "compact") -> Path:
     """The default output folder, beside a folder: ``scenes_compact`` for ``scenes``."""
     place = Path(os.path.abspath(folder))
-    return unnamed(place.with_name(f"{place.name}_compact"))
+    return unnamed(place.with_name(f"{place.name}_{done}"))
 
 
 _loaded = functools.cache(load_refiner)  # once in each process
 
 
 @dataclass(frozen=True)
-class _Task:
-    """A scene to compact, and the file to write."""
+class Task:
+    """A scene to work on, and the file to write."""
 
     name: str
     source: Path
@@ -305,17 +336,38 @@ def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
     write_json(options, path)
 
 
-@dataclass(frozen=True)
-class _Compacting:
-    """Compacts a scene of a folder, unless it is finished. Pickled for other processes."""
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A scene of a folder and its result, which is not written yet."""
 
-    options: CompactOptions
-    refiner: str | Path | None  # loaded by each process
+    dense: Gaussians
+    scene: Gaussians
+    kind: Format
+    """Format of the result."""
+    note: str = ""
+    """Note on the result; empty if there is none."""
+    psnr_of: Callable[[Gaussians], float] | None = None
+    """PSNR of the result as it is read from its file, dB; None if it is not compared."""
+
+
+@dataclass(frozen=True)
+class FolderWork:
+    """Work on the scenes of a folder, one after the other. Pickled for other processes."""
+
     record: Mapping[str, Any]  # options as recorded, to recognise results of other options
     drawn: bool  # whether to draw each scene before and after
     force: bool
+    label: ClassVar[str]
+    """Name of the work, beside its progress."""
 
-    def __call__(self, task: _Task) -> SceneResult:
+    def make(self, task: Task) -> Made:
+        """The result of a scene."""
+        raise NotImplementedError
+
+    def draw(self, task: Task, before: Gaussians, after: Gaussians) -> None:
+        """Draw a scene and its result to a file."""
+
+    def __call__(self, task: Task) -> SceneResult:
         """The result of a scene. On an error its status is ``failed``, and no file is left."""
         start = time.perf_counter()
         try:
@@ -337,9 +389,9 @@ class _Compacting:
                     "folder, or overwrite it with --force"
                 )
             if record is None or not whole or record["key"] != key:
-                return self._make(task, source.bytes, key, start)
+                return self._written(task, source.bytes, key, start)
             if self.drawn and not is_own_file(pair_of(task.output)):
-                self._draw(task, read_scene(task.source), read_scene(task.output))
+                self.draw(task, read_scene(task.source), read_scene(task.output))
             return _known(task, record)
         except Exception as error:  # one scene must not stop the others
             expected = isinstance(error, (PointSplatError, OSError))
@@ -350,10 +402,44 @@ class _Compacting:
                 error=kind + one_line(error, limit=1000),
             )
 
-    def _make(self, task: _Task, source_bytes: int, key: str, start: float) -> SceneResult:
+    def _written(self, task: Task, source_bytes: int, key: str, start: float) -> SceneResult:
         """Write a result and its record. A process killed in between leaves only the record, so the
         scene counts as open."""
         new = not self.force and not os.path.lexists(task.output)
+        made = self.make(task)
+        with replacing(task.output, named=False, new=new) as part:
+            save_as(made.kind, made.scene, part, name=task.output)
+            written = read_back(made.scene, part, made.kind) if made.psnr_of else made.scene
+            psnr = made.psnr_of(written) if made.psnr_of else math.inf
+            done = task.result(
+                "done",
+                before=len(made.dense),
+                after=len(made.scene),
+                megabytes_before=source_bytes / 1e6,
+                megabytes=part.stat().st_size / 1e6,
+                psnr=psnr if math.isfinite(psnr) else None,
+                seconds=time.perf_counter() - start,
+                note=made.note,
+            )
+            # Old files must not remain beside the new record.
+            for old in (pair_of(task.output), *(() if new else (task.output,))):
+                old.unlink(missing_ok=True)
+            proofs = {"key": key, "options": self.record, "sha256": content_hash(part)}
+            write_json({**dataclasses.asdict(done), **proofs}, task.record)
+        if self.drawn:
+            self.draw(task, made.dense, written)
+        return done
+
+
+@dataclass(frozen=True)
+class _Compacting(FolderWork):
+    """Compacts the scenes of a folder."""
+
+    options: CompactOptions
+    refiner: str | Path | None  # loaded by each process
+    label: ClassVar[str] = "compact"
+
+    def make(self, task: Task) -> Made:
         dense = read_scene(task.source)
         kind = self.options.format_of(task.output.name)
         options = dataclasses.replace(self.options, target_format=kind.suffix)
@@ -368,30 +454,16 @@ class _Compacting:
         same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
         differs = not same or kind.suffix != ".ply"
         judge = (made.judge or judge_of(dense, views)) if differs else None
-        with replacing(task.output, named=False, new=new) as part:
-            save_as(kind, scene, part, name=task.output)
-            written = read_back(scene, part, kind)
-            psnr = math.inf if judge is None else judge.psnr(written)[0]
-            done = task.result(
-                "done",
-                before=len(dense),
-                after=len(scene),
-                megabytes_before=source_bytes / 1e6,
-                megabytes=part.stat().st_size / 1e6,
-                psnr=psnr if math.isfinite(psnr) else None,
-                seconds=time.perf_counter() - start,
-                note="unchanged" if same else f"no dataset: {views.missing}" * bool(views.missing),
-            )
-            # Old files must not remain beside the new record.
-            for old in (pair_of(task.output), *(() if new else (task.output,))):
-                old.unlink(missing_ok=True)
-            proofs = {"key": key, "options": self.record, "sha256": content_hash(part)}
-            write_json({**dataclasses.asdict(done), **proofs}, task.record)
-        if self.drawn:
-            self._draw(task, dense, written)
-        return done
+        note = "unchanged" if same else f"no dataset: {views.missing}" * bool(views.missing)
+        return Made(
+            dense=dense,
+            scene=scene,
+            kind=kind,
+            note=note,
+            psnr_of=lambda written: math.inf if judge is None else judge.psnr(written)[0],
+        )
 
-    def _draw(self, task: _Task, before: Gaussians, after: Gaussians) -> None:
+    def draw(self, task: Task, before: Gaussians, after: Gaussians) -> None:
         """Draw a scene and its result to a file, unless the scene is invisible."""
         after = after if after.offset is None else after.at_offset(before.offset)
         views = ViewProvider(before, run=task.source, data=self.options.data)
@@ -399,7 +471,7 @@ class _Compacting:
             draw_pair(before, after, views.known(VIEW_COUNTS.opening), pair_of(task.output))
 
 
-def _read_record(task: _Task) -> dict[str, Any] | None:
+def _read_record(task: Task) -> dict[str, Any] | None:
     """The record of a result; None if it is missing or damaged."""
     if not is_own_file(task.record):
         return None
@@ -412,7 +484,7 @@ def _read_record(task: _Task) -> dict[str, Any] | None:
     return record if texts and numbers else None
 
 
-def _known(task: _Task, record: dict[str, Any] | None) -> SceneResult:
+def _known(task: Task, record: dict[str, Any] | None) -> SceneResult:
     """The result in a record; without a record an open result."""
     if record is None:
         return task.result("open")

@@ -87,11 +87,11 @@ def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
         (("compact", "rooms", "-o", "rooms"), "rooms: contains the scenes themselves"),
         (("compact", "rooms/room1.ply", "--jobs", "2"), "a single scene; --jobs is for a folder"),
         (("compact", "empty"), "empty: no scene below it"),
-        (("convert", "rooms", "out"), "compact and info accept a folder of scenes"),
-        (("prune", "rooms"), "compact and info accept a folder of scenes"),
+        (("convert", "rooms", "out"), "expected the format of the results, such as --to .spz"),
+        (("prune", "rooms"), "pointsplat compact rooms --effort instant merges them all"),
         (("info", "empty"), "empty: no scene below it"),
-        (("lod", "rooms"), "accept a folder of scenes"),
-        (("clean", "rooms"), "accept a folder of scenes"),
+        (("lod", "rooms"), "for a folder of scenes: compact, convert and info accept one"),
+        (("clean", "rooms"), "for a folder of scenes: compact, convert and info accept one"),
     ],
 )
 def test_what_does_not_fit_a_folder_is_refused_in_one_line(
