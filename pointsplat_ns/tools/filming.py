@@ -129,7 +129,7 @@ def open_viewer(
     """Show a scene, or two scenes with the same camera, in a browser, which renders with WebGL 2.
 
     The page opens upright, at the known or sampled view that shows most of the scene, or at a view
-    of a whole object.
+    of a whole object. It says if the file of a scene changes or disappears meanwhile.
 
     Args:
         scene: N Gaussians, or the path of a scene; by default the page opens a dropped file.
@@ -158,6 +158,7 @@ def open_viewer(
     """
     from pointsplat_ns.tools.pages.slider_scenes import ViewedScene
     from pointsplat_ns.tools.pages.viewer import Viewer
+    from pointsplat_ns.tools.pages.watched_file import WatchedFile
 
     upward = up_named(up)
 
@@ -168,6 +169,7 @@ def open_viewer(
     scenes: list[ViewedScene] = []
     for index, shown in enumerate(item for item in (scene, other) if item is not None):
         path = None if isinstance(shown, Gaussians) else Path(shown)
+        file = None if path is None else WatchedFile(path)
         if scenes:
             loaded = _loaded(shown).at_offset(scenes[0].scene.offset)
             source = ViewProvider(loaded, run=path)
@@ -182,7 +184,7 @@ def open_viewer(
             if path is None or (path / RUN_FILES.config).is_file()
             else coarser_levels(path, len(loaded))
         )
-        scenes.append(ViewedScene(_name(shown, index), path, loaded, source, levels))
+        scenes.append(ViewedScene(_name(shown, index), path, loaded, source, levels, file))
     return Viewer(scenes, host, port, upward, None if scenes else read)
 
 

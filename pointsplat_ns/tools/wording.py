@@ -25,6 +25,7 @@ from pointsplat_ns.rendering.comparison.closeness import LEAST_OPACITY, Closenes
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.system.quantities import counted
+from pointsplat_ns.tools.pages.watched_file import FileState
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -183,6 +184,16 @@ def closeness_text(close: Closeness) -> str:
     """Number and width of the compared views."""
     width = "" if close.width is None else f" of {close.width} pixels"
     return views_text(len(close.errors)) + width
+
+
+def file_state_text(name: str, state: FileState) -> str:
+    """State of the file of a shown scene; empty if it is as it was read."""
+    shown = f"the page shows {name} as it was read"
+    return {
+        FileState.SAME: "",
+        FileState.CHANGED: f"{name} has changed on disk: {shown}; start pointsplat view again",
+        FileState.GONE: f"{name} is gone from disk, or cannot be read: {shown}",
+    }[state]
 
 
 def reason_text(reason: Reason) -> str:

@@ -18,6 +18,7 @@ from pointsplat_ns.pruning.merging import Merger
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.usable import keep_usable
 from pointsplat_ns.system.files import one_line
+from pointsplat_ns.tools.pages.watched_file import WatchedFile
 
 
 @dataclass(eq=False)
@@ -42,6 +43,7 @@ class ViewedScene:
     Args:
         name: name to show.
         path: path of the scene; None if it has none.
+        file: the file of the scene, to notice its changes; None if it has none.
         scene: N Gaussians.
         source: source of views for merging.
         there: existing smaller scenes, such as levels of a stream; each serves shares near its
@@ -55,10 +57,12 @@ class ViewedScene:
         scene: Gaussians,
         source: ViewProvider,
         there: Sequence[Gaussians] = (),
+        file: WatchedFile | None = None,
     ):
         need_usable(scene)
         self.name = name
         self.path = path
+        self.file = file
         self.source = source
         self.scene = keep_usable(scene, name)
         """All drawable Gaussians."""

@@ -23,7 +23,7 @@ from pointsplat_ns.tools.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.tools.pages.html import page
 from pointsplat_ns.tools.pages.server import Answer, Request, Route, Server
 from pointsplat_ns.tools.pages.slider_scenes import Level, ViewedScene
-from pointsplat_ns.tools.wording import missing_text, origin_text
+from pointsplat_ns.tools.wording import file_state_text, missing_text, origin_text
 from pointsplat_ns.view_sampling.upright import Up
 
 READABLE_NAMES = (
@@ -73,6 +73,11 @@ class _Stage:
                 )
         return {"amount": amount, "command": command, "how": level.how, "whole": whole}
 
+    def notes(self) -> list[str]:
+        """Notes on files of the scenes that have changed, or are gone, since they were read."""
+        states = [(viewed.name, viewed.file.state()) for viewed in self.scenes if viewed.file]
+        return [*filter(None, (file_state_text(name, state) for name, state in states))]
+
     def close(self, timeout: float) -> None:
         """Stop merging, and wait for at most ``timeout`` seconds."""
         for viewed in self.scenes:
@@ -103,7 +108,11 @@ class Viewer(AbstractContextManager["Viewer"]):
         self._working = threading.Lock()
         self._dropping = threading.Lock()
         self._stage: _Stage | None = None
-        routes = {"/": Route(self._page), "/scene": Route(self._scene, 1_024)}
+        routes = {
+            "/": Route(self._page),
+            "/scene": Route(self._scene, 1_024),
+            "/watch": Route(self._watch),
+        }
         if read is not None:
             routes["/drop"] = Route(self._drop, LARGEST_FILE)
         if scenes:
@@ -173,6 +182,14 @@ class Viewer(AbstractContextManager["Viewer"]):
             # machine.
             level.spz = level.spz or stage.frame.encoded(level.scene, viewed.name, level=1)
         return Answer(level.spz, "application/octet-stream", headers=headers)
+
+    def _watch(self, request: Request) -> Answer:
+        """The number of the stage, and notes on files of its scenes that are not as they were
+        read."""
+        stage = self._stage
+        notes = [] if stage is None else stage.notes()
+        content = {"stage": 0 if stage is None else stage.number, "notes": notes}
+        return Answer(json.dumps(content).encode(), "application/json")
 
     def _drop(self, request: Request) -> Answer:
         """Show the scene of a dropped file. The client's file name is only displayed, never used as

@@ -2,6 +2,8 @@
 
 const DAMAGED = "The scene came damaged";
 const REST = 600; // milliseconds until a share counts as chosen: then its Gaussians are merged
+const WATCH = 2000; // milliseconds between two looks at the files of the scenes
+const ENDED = "The viewer does not answer. Has pointsplat view ended?";
 
 class Live extends Flight {
   async load() {
@@ -11,6 +13,7 @@ class Live extends Flight {
     this.whole = [];
     this.root = this.part.stage.parentElement;
     this.start();
+    this.watch();
     for (let index = 0; index < this.kept.length; index++) {
       this.say(`Loading ${this.data.scenes[index].name} …`);
       const { state, spz } = await this.ask(index, "");
@@ -84,6 +87,20 @@ class Live extends Flight {
     code.hidden = !command;
   }
 
+  // Say that the file of a scene has changed or is gone, or that the viewer has ended.
+  async watch() {
+    const note = document.getElementById("changed");
+    for (;;) {
+      await new Promise((done) => setTimeout(done, WATCH));
+      if (document.hidden) continue;
+      const answer = await fetch("/watch").then((found) => found.json()).catch(() => ({ stage: this.data.stage, notes: [ENDED] }));
+      if (answer.stage !== this.data.stage) return location.reload(); // another scene is shown by now
+      const text = answer.notes.join(" ");
+      if (note.textContent !== text) note.textContent = text;
+      note.hidden = !text;
+    }
+  }
+
   get still() {
     return super.still && !this.asking;
   }
@@ -93,7 +110,7 @@ class Live extends Flight {
     const body = JSON.stringify({ stage: this.data.stage, scene: index, percent, have, spz: !isHere });
     const answer = await fetch("/scene", { method: "POST", body }).catch(() => ({ ok: false }));
     if (answer.status === 409) location.reload(); // another scene is shown by now
-    if (!answer.ok) throw new Error("The viewer does not answer. Has pointsplat view ended?");
+    if (!answer.ok) throw new Error(ENDED);
     return { state: JSON.parse(answer.headers.get("X-State")), spz: new Uint8Array(await answer.arrayBuffer()) };
   }
 }
