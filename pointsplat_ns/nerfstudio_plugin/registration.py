@@ -38,8 +38,8 @@ def load_specification(name: str, build: Callable[[], Any]) -> Any:
 
 
 def errors_in_one_line() -> None:
-    """Print an uncaught :class:`PointSplatError` in one line, without its traceback. The exit
-    status is 1."""
+    """Print an uncaught :class:`PointSplatError` or an interruption in one line, without its
+    traceback. The exit status is 1, or that of an interrupted program."""
     before = sys.excepthook
 
     def print_error(
@@ -47,6 +47,8 @@ def errors_in_one_line() -> None:
     ) -> None:
         if isinstance(error, PointSplatError):
             say(f"error: {error}", error=True)
+        elif isinstance(error, KeyboardInterrupt):
+            say("interrupted", error=True)
         else:
             before(kind, error, traceback)
             if hint := _export_hint(sys.argv):

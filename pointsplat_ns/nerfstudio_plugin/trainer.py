@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -134,7 +134,8 @@ class StoppableTrainer(Trainer):
     Checkpoints and the config are written beside and renamed, so that one that is there is whole.
     Ctrl-C and SIGTERM end it after the step at hand, with a checkpoint of that step, and with the
     status of an interrupted program: in the middle of densification, parameters are of different
-    numbers. A second one ends it at once.
+    numbers. Before the first step they end it at once, and after the last step once its results are
+    written. A second one ends it at once.
 
     A step whose loss or gradients are not finite, in any process, changes neither parameters nor
     the optimisers' state nor buffers. It is counted, and the log names its photo or scene. The
@@ -150,6 +151,10 @@ class StoppableTrainer(Trainer):
     """Number of the signal that asked it to stop."""
     _between_steps = False
     """Whether it was stopped where a checkpoint can be saved."""
+    _begun = False
+    """Whether the first step of this call has begun."""
+    _finishing = False
+    """Whether the results of all steps are being written."""
 
     def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
         super().__init__(config, local_rank, world_size)
@@ -163,7 +168,7 @@ class StoppableTrainer(Trainer):
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
-            with self._no_folder_of_nothing():
+            with self._signals_heeded(self._end), self._no_folder_of_nothing():
                 if self.config.is_viewer_enabled() or self.config.is_viewer_legacy_enabled():
                     self.base_dir.mkdir(parents=True, exist_ok=True)  # for the viewer's log
                 super().setup(test_mode)
@@ -173,7 +178,7 @@ class StoppableTrainer(Trainer):
             if self.local_rank == 0 and isinstance(model, RasterizerOptions):
                 log(model.engine(torch.device(self.device)))
         except KeyboardInterrupt:
-            _interrupted(signal.SIGINT)
+            _interrupted(self._asked or signal.SIGINT)
         if self.local_rank == 0:
             # nerfstudio takes the steps of this call for the last step, also where a training
             # resumes from a later one.
@@ -182,19 +187,27 @@ class StoppableTrainer(Trainer):
     def train(self) -> None:
         """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130.
         nerfstudio saves none and ends with 0, as if it had finished."""
-        with fixed_threads(self.config.threads), self._signals_noted():
+        with fixed_threads(self.config.threads), self._signals_heeded(self._note):
             try:
                 with self._no_folder_of_nothing():
                     super().train()
             except KeyboardInterrupt:
-                if self._between_steps and self.step > self._start_step:
-                    self.save_checkpoint(self.step - 1)
-                    log(
-                        f"Saved after step {self.step - 1}. The run is usable as it is; to go on: "
-                        f"--load-dir {self.checkpoint_dir}"
-                    )
-                    self.show_progress()
+                with suppress(KeyboardInterrupt):  # a second one
+                    self._save_interrupted()
                 _interrupted(self._asked or signal.SIGINT)
+
+    def _save_interrupted(self) -> None:
+        """Save a checkpoint of the steps that an interrupted training has done, if they can be
+        saved and are not yet, and say so."""
+        if self.training_state == "completed":
+            log(f"All steps are done and saved: {self.checkpoint_dir}")
+        elif self._between_steps and self.step > self._start_step:
+            self.save_checkpoint(self.step - 1)
+            log(
+                f"Saved after step {self.step - 1}. The run is usable as it is; to go on: "
+                f"--load-dir {self.checkpoint_dir}"
+            )
+            self.show_progress()
 
     @contextmanager
     def _no_folder_of_nothing(self) -> Iterator[None]:
@@ -245,9 +258,22 @@ class StoppableTrainer(Trainer):
     def put_back(self, state: Any) -> None:
         """Put back :meth:`state_to_resume`; None if the checkpoint has none."""
 
+    def _after_train(self) -> None:
+        """As nerfstudio's. A signal waits until the results are written."""
+        self._finishing = True
+        super()._after_train()
+
+    def results_written(self) -> None:
+        """From now on, a signal ends the program at once. Raises KeyboardInterrupt if one has
+        come."""
+        self._finishing = False
+        if self._asked is not None:
+            raise KeyboardInterrupt
+
     def _train_complete_viewer(self) -> None:
         """Keep the viewer open after the last step until Ctrl-C or SIGTERM, once: the training is
         complete."""
+        self._finishing = False
         with suppress(KeyboardInterrupt):
             if self._asked is None:
                 super()._train_complete_viewer()
@@ -259,6 +285,7 @@ class StoppableTrainer(Trainer):
         if self._asked is not None:
             self._between_steps = True
             raise KeyboardInterrupt
+        self._begun = True
         with one_thread_each():
             buffers = [(buffer, buffer.clone()) for buffer in self.pipeline.model.buffers()]
             self.optimizers.zero_grad_all()
@@ -369,10 +396,9 @@ class StoppableTrainer(Trainer):
         return {}
 
     @contextmanager
-    def _signals_noted(self) -> Iterator[None]:
-        """While this is open, signals that would end the program end the training after its step.
-        Not where several processes train together: they save together, and one of them cannot stop
-        alone."""
+    def _signals_heeded(self, heed: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+        """While this is open, ``heed`` handles signals that would end the program. Not where
+        several processes train together: they save together, and one of them cannot stop alone."""
         before = {}
         if threading.current_thread() is threading.main_thread() and self.world_size == 1:
             for number, usual in (
@@ -380,21 +406,28 @@ class StoppableTrainer(Trainer):
                 (signal.SIGTERM, signal.SIG_DFL),
             ):
                 if signal.getsignal(number) is usual:
-                    before[number] = signal.signal(number, self._note)
+                    before[number] = signal.signal(number, heed)
         try:
             yield
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal before the first step."""
+        self._asked = number
+        raise KeyboardInterrupt
+
     def _note(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal."""
         first = self._asked is None
         self._asked = self._asked or number
         self._between_steps = self.training_state == "paused"
-        if not first or self.training_state != "training":
+        waits = self._finishing or (self._begun and self.training_state == "training")
+        if not (first and waits):
             raise KeyboardInterrupt
-        say("stopping after this step; once more to stop at once, without saving it", error=True)
+        when = "once the results are written" if self._finishing else "after this step"
+        say(f"stopping {when}; once more to stop at once, without saving", error=True)
 
 
 def all_finite(parameters: list[nn.Parameter]) -> bool:

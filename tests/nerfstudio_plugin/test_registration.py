@@ -1,5 +1,6 @@
 """Registration, options and warnings."""
 
+import signal
 import subprocess
 import sys
 import warnings
@@ -62,6 +63,11 @@ def test_an_input_error_ends_a_command_with_one_line_and_status_1():
             [sys.executable, "-c", code.format(error)], capture_output=True, text=True
         )
         assert run.returncode == 1 and run.stderr.startswith(said)
+    interrupted = subprocess.run(
+        [sys.executable, "-c", code.format("KeyboardInterrupt")], capture_output=True, text=True
+    )
+    assert interrupted.stderr == "interrupted\n"
+    assert interrupted.returncode in (-signal.SIGINT, 128 + signal.SIGINT)
     methods = Path(__file__).parents[2] / "method_configs" / "methods.py"
     assert "errors_in_one_line()" in methods.read_text()
 

@@ -111,7 +111,8 @@ class PointSplatTrainer(StoppableTrainer):
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """See the base class. Curves of tensorboard have the names of scenes."""
-        if step == self._start_step and self.config.steps_per_eval_image > 0:
+        first = step == self._start_step and self._asked is None
+        if first and self.config.steps_per_eval_image > 0:
             self._measure(step)
         loss, _, metrics = super().train_iteration(step)
         scene = self.pipeline.datamanager.scenes[metrics["scene"]]
@@ -203,7 +204,9 @@ class PointSplatTrainer(StoppableTrainer):
         return left * median(self._step_seconds)
 
     def report(self) -> None:
-        """Measure all scenes at the end, and print and draw what the training gained."""
+        """Measure all scenes at the end, and print and draw what the training gained. Raises
+        KeyboardInterrupt if the training was asked to stop while its results were written."""
+        self.results_written()
         done = self.step + 1
         measured = self.progress.measure(done)
         if processes.rank() != 0:
