@@ -1,6 +1,8 @@
 """Outputs: refused, claimed, replaced, interrupted."""
 
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -11,7 +13,7 @@ import torch
 from refusing import refusal
 
 import pointsplat_ns as ps
-from making import ball
+from making import REPOSITORY, ball
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.pipeline import repair
@@ -298,3 +300,30 @@ def test_a_repair_that_is_interrupted_is_written_and_the_status_says_so(
     out, err = capsys.readouterr()
     assert end.value.code == 130 and err.endswith("interrupted\n")
     assert "room_compact.ply" in out and len(ps.load("room_compact.ply")) == 75
+
+
+PROCESSES = {
+    "room_pruned.ply": ("prune", "room.ply", "--keep", "50%", "--by", "opacity"),
+    "room.splat": ("convert", "room.ply", "room.splat"),
+    "room_lod": ("lod", "room.ply", "--levels", "50%"),
+}
+"""Commands of which two are started at once, by what they write."""
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_of_two_processes_with_one_output_only_one_succeeds(name, scenes, here):
+    code = "import sys; from pointsplat_ns.start import program; sys.exit(program())"
+    command = [sys.executable, "-c", code, *PROCESSES[name]]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+    started = [
+        subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+        for _ in range(2)
+    ]
+    errors = [process.communicate()[1] for process in started]
+    assert sorted(process.returncode for process in started) == [0, 1], errors
+    (refused,) = (
+        error for error, process in zip(errors, started, strict=True) if process.returncode
+    )
+    # Claimed by the other one, written by it before, or put there meanwhile.
+    assert "another command is writing it" in refused or "exists already" in refused
+    assert not hidden(here)
