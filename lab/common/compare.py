@@ -13,7 +13,7 @@ from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.scene.runs import open_run, scene_name
 from pointsplat_ns.scene.views import Views
-from pointsplat_ns.tools.tradeoff.measuring import photos_of_one_size
+from pointsplat_ns.tools.tradeoff.measuring import photos_with_views
 
 METRICS = ("psnr", "ssim", "lpips")
 
@@ -22,9 +22,11 @@ def dataset_photos(
     path: Path | str, split: Literal["train", "test"], count: int, data: Path | str | None = None
 ) -> tuple[Views, list[Tensor]]:
     """At most ``count`` photos (H, W, 3) in [0, 1] of a run's dataset, evenly spread, and their
-    views on the CPU."""
-    views, photos, _ = photos_of_one_size(run_photos(path, split, data), count)
-    return views, [photo.target for photo in photos]
+    views on the CPU; of photos of several sizes, those of the most common one."""
+    views, photos = photos_with_views(run_photos(path, split, data), count)
+    common = views.image_sizes()[0]
+    of_size = [index for index, size in enumerate(views.size_of_each()) if size == common]
+    return views[of_size], [photos[index].target for index in of_size]
 
 
 def photos_of(

@@ -15,9 +15,9 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl, viewmats_to_opengl
 from pointsplat_ns.rendering import rasterization
 from pointsplat_ns.rendering.rasterize import use_gsplat
-from pointsplat_ns.scene.views import EPS2D, NEAR_PLANE, RasterizeMode, Views
+from pointsplat_ns.scene.views import EPS2D, NEAR_PLANE, ImageSize, RasterizeMode, Views
 from pointsplat_ns.system.kernels import KERNELS
-from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.system.tensors import DOUBLES, INDICES
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in
@@ -68,12 +68,15 @@ def cameras_of_views(views: Views) -> Cameras:
     poses = viewmats_to_opengl(views.viewmats.double().cpu()).float()
     Ks = views.Ks.float().cpu()
     fx, fy, cx, cy = (Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    ours = {"near_plane": views.near_plane, "eps2d": views.eps2d}
-    metadata = {name: torch.full((len(views), 1), value, **DOUBLES) for name, value in ours.items()}
+    eps2d = [size.eps2d for size in views.size_of_each()]
+    metadata = {
+        "near_plane": torch.full((len(views), 1), views.near_plane, **DOUBLES),
+        "eps2d": torch.tensor(eps2d, **DOUBLES)[:, None],
+    }
+    sizes = torch.tensor([size[:2] for size in views.size_of_each()], **INDICES).view(-1, 2)
+    width, height = sizes.split(1, dim=1)
     kind = CameraType.PERSPECTIVE
-    return Cameras(
-        poses, fx, fy, cx, cy, views.width, views.height, camera_type=kind, metadata=metadata
-    )
+    return Cameras(poses, fx, fy, cx, cy, width, height, camera_type=kind, metadata=metadata)
 
 
 def carried(cameras: Cameras) -> dict[str, float]:
@@ -107,12 +110,21 @@ def need_pinhole(camera: Cameras) -> None:
 def views_of_cameras(
     cameras: Cameras, background: Tensor, rasterize_mode: RasterizeMode = "classic"
 ) -> Views:
-    """nerfstudio cameras (C,) as pinhole views on their device. Lens distortion is ignored. Raises
-    DataError if the cameras have images of several sizes, or differ in near plane or ``eps2d``."""
-    sizes = {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)}
-    if len(sizes) != 1:
-        raise DataError(f"photos of {len(sizes)} sizes; expected one size for all views")
-    ((width, height),) = sizes
-    viewmats = viewmats_from_opengl(cameras.camera_to_worlds)
-    Ks = cameras.get_intrinsics_matrices()
-    return Views(viewmats, Ks, width, height, background, rasterize_mode, **carried(cameras))
+    """nerfstudio cameras (C,), C at least 1, as pinhole views on their device, each of its image
+    size. Lens distortion is ignored. Raises DataError if the cameras differ in near plane or
+    ``eps2d``."""
+    same = carried(cameras)
+    images = [
+        ImageSize(int(width), int(height), same["eps2d"])
+        for width, height in zip(cameras.width, cameras.height, strict=True)
+    ]
+    return Views(
+        viewmats=viewmats_from_opengl(cameras.camera_to_worlds),
+        Ks=cameras.get_intrinsics_matrices(),
+        width=images[0].width,
+        height=images[0].height,
+        background=background,
+        rasterize_mode=rasterize_mode,
+        images=images,
+        **same,
+    )

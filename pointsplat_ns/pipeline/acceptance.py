@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pointsplat_ns.pipeline.reasons import Cause, Reason
 from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.rendering.comparison.closeness import Closeness, DenseReference
-from pointsplat_ns.rendering.comparison.sizes import NEARER, RendersOfSizes, sides_of
+from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes, other_sizes
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -53,10 +53,8 @@ class Comparison:
     def __init__(self, dense: Gaussians, views: ViewProvider):
         self.reference = DenseReference(dense, views.compared())
         self.device = dense.device
-        whole = views.whole()
-        sides = sides_of(whole.width, whole.height)
-        others = (sides[0], sides[-1], NEARER * sides[-1])
-        self._others = RendersOfSizes(dense, whole, others) if len(sides) > 1 else None
+        others = other_sizes(views.whole())
+        self._others = RendersOfSizes(dense, others) if others else None
 
     def judge(
         self, before: Closeness, old: Gaussians, new: Gaussians, progress: Progress = silent

@@ -196,4 +196,5 @@ def _digest(views: Views | None) -> str:
     if views is None:
         return ""
     numbers = views.viewmats.double().numpy().tobytes() + views.Ks.double().numpy().tobytes()
-    return hashlib.sha256(numbers + repr((views.width, views.height)).encode()).hexdigest()
+    size = (views.width, views.height) if views.images is None else views.images
+    return hashlib.sha256(numbers + repr(size).encode()).hexdigest()

@@ -24,10 +24,11 @@ from pointsplat_ns.pipeline.view_provider import ViewOrigin, ViewProvider
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
 from pointsplat_ns.rendering.comparison.fill import fill
-from pointsplat_ns.rendering.comparison.sizes import subsampled
+from pointsplat_ns.rendering.comparison.sizes import longer_side, subsampled
 from pointsplat_ns.scene.formats import Format, format_to_write
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.usable import usable_part
+from pointsplat_ns.scene.views import ImageSize, Views
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.system.tensors import DOUBLES, INDICES
 from pointsplat_ns.system.threads import one_thread_each
@@ -79,9 +80,9 @@ class Quality:
     views: int
     """Number of views."""
     width: int
-    """Width of their pictures, pixels."""
+    """Width of their pictures, pixels; the most common one, if there are several sizes."""
     height: int
-    """Height of their pictures, pixels."""
+    """Height of their pictures, pixels, as :attr:`width`."""
     origin: ViewOrigin | None
     """Origin of the views."""
     fill_before: float
@@ -92,6 +93,8 @@ class Quality:
     """Gain of training on photos; None without training."""
     opacity: float = 1.0
     """Mean opacity of the dense scene on the pixels where it draws anything, in [0, 1]."""
+    other_sizes: tuple[ImageSize, ...] = ()
+    """Sizes of the pictures that are not of the most common one."""
 
 
 class Judge:
@@ -109,27 +112,30 @@ class Judge:
         self.dense = dense
         self.views = source.whole()
         self.origin = source.origin
-        self.side = max(self.views.width, self.views.height)
 
     @cached_property
     def _pixels(self) -> DenseReference:
-        return DenseReference(
-            self.dense, subsampled(self.views, self.side, min(self.side, JUDGING.side))
-        )
+        def drawn(views: Views) -> Views:
+            side = longer_side(views)
+            return subsampled(views, side, min(side, JUDGING.side))
+
+        return DenseReference(self.dense, self.views.each_size(drawn))
 
     @cached_property
     def _bands(self) -> DenseReference | None:
         views = self.views
-        if min(views.width, views.height) < SSIM_WINDOW:
+        if min(min(size[:2]) for size in views.image_sizes()) < SSIM_WINDOW:
             return None
-        rows = min(views.height, max(JUDGING.band_rows, JUDGING.band_pixels // views.width))
         views = views[torch.arange(len(views), **INDICES).repeat_interleave(JUDGING.bands)]
+        sizes = views.size_of_each()
+        bands = [size._replace(height=_band_rows(size)) for size in sizes]
         # Multiples of the golden ratio spread evenly.
         shares = (0.618 * torch.arange(len(views), **DOUBLES)).frac()
-        tops = shares * (views.height - rows)
+        above = [size.height - band.height for size, band in zip(sizes, bands, strict=True)]
+        tops = shares * torch.tensor(above, **DOUBLES)
         Ks = views.Ks.clone()
         Ks[:, 1, 2] -= tops.round().to(Ks)
-        return DenseReference(self.dense, replace(views, Ks=Ks, height=rows))
+        return DenseReference(self.dense, replace(views, Ks=Ks, images=bands))
 
     def psnr(
         self, scene: Gaussians, progress: Callable[[float], None] | None = None
@@ -151,6 +157,7 @@ class Judge:
             views=len(self.views),
             width=self.views.width,
             height=self.views.height,
+            other_sizes=tuple(self.views.image_sizes()[1:]),
             origin=self.origin,
             fill_before=self._fill,
             fill=fill(scene, self.views),
@@ -163,6 +170,11 @@ class Judge:
 
     def _placed(self, scene: Gaussians) -> Gaussians:
         return scene.at_offset(self.dense.offset).to(self.dense.device)
+
+
+def _band_rows(size: ImageSize) -> int:
+    """Number of rows of a band of an image."""
+    return min(size.height, max(JUDGING.band_rows, JUDGING.band_pixels // size.width))
 
 
 def quality_of_file(judge: Judge | None, scene: Gaussians, path: Path) -> Quality | None:

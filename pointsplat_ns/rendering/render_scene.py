@@ -14,7 +14,7 @@ from pointsplat_ns.rendering.constants import ALPHA_MIN, QUALITIES
 from pointsplat_ns.rendering.projection import camera_to, drawn_antialiased
 from pointsplat_ns.rendering.rasterize import Colors, QualityName, rasterization
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.scene.views import View, Views
+from pointsplat_ns.scene.views import View, Views, sizes_text
 from pointsplat_ns.system.threads import one_thread_each
 
 
@@ -29,8 +29,8 @@ def render(
 
     Args:
         scene: N Gaussians, on any device, which renders the image.
-        views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views`, which are rendered
-            one after the other.
+        views: a :class:`~pointsplat_ns.View`, or :class:`~pointsplat_ns.Views` of one image size,
+            which are rendered one after the other.
         quality: "exact", or faster and less accurate, "balanced" or "fast", as for
             :func:`pointsplat_ns.rasterization`.
         backend: "torch", or gsplat if it can be used ("auto"), as for
@@ -41,7 +41,8 @@ def render(
 
     Raises:
         TypeError: if ``views`` has another type.
-        ValueError: if a camera is not finite or has no focal length, or the quality is unknown.
+        ValueError: if a camera is not finite or has no focal length, the quality is unknown, or the
+            views have several image sizes.
 
     Warns:
         UserWarning: if some Gaussians are not :meth:`~pointsplat_ns.Gaussians.usable`; their
@@ -55,6 +56,11 @@ def render(
         ((48, 64, 3), (2, 48, 64, 3))
     """
     if isinstance(views, Views):
+        if views.images is not None:
+            raise ValueError(
+                f"views have images of {sizes_text(views.image_sizes())} pixels; expected one "
+                "size, or one view at a time: [render(scene, view) for view in views]"
+            )
         if len(views) == 0:
             return scene.means.new_zeros(0, views.height, views.width, 3)
         return torch.stack([render(scene, view, quality, backend) for view in views])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import torch
 from torch import Tensor
@@ -48,9 +49,29 @@ class View:
         return f"View({self.width} x {self.height} pixels, {self.rasterize_mode})"
 
 
+class ImageSize(NamedTuple):
+    """Size of a view's image."""
+
+    width: int  # pixels
+    height: int  # pixels
+    eps2d: float = EPS2D  # pixels^2
+
+    def __str__(self) -> str:
+        return f"{self.width} x {self.height}"
+
+
+def sizes_text(sizes: Iterable[ImageSize]) -> str:
+    """Image sizes in pixels, without the unit: ``640 x 480``, ``640 x 480 and 480 x 640``, or
+    ``640 x 480 and 3 other sizes``."""
+    first, *others = dict.fromkeys(map(str, sizes))
+    if not others:
+        return first
+    return f"{first} and {others[0] if len(others) == 1 else f'{len(others)} other sizes'}"
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Views:
-    """C pinhole cameras of one image size, and rendering settings.
+    """C pinhole cameras, and rendering settings.
 
     ``views[0]`` and iteration give a :class:`View`; slices, lists of indices, index tensors and
     boolean masks give :class:`Views`.
@@ -59,15 +80,18 @@ class Views:
         viewmats: (C, 4, 4) world-to-camera, OpenCV axes (x right, y down, z forward); rigid, in
             scene units.
         Ks: (C, 3, 3) intrinsics in pixels; the centre of the first pixel is (0.5, 0.5).
-        width: width of every image, pixels.
-        height: height of every image, pixels.
+        width: width of every image, pixels; with ``images``, the width of the most common size, and
+            of the largest of equally common ones.
+        height: height of every image, pixels, as ``width``.
         background: (3,) colour behind the scene, RGB in [0, 1].
         rasterize_mode: "classic" or "antialiased", as in the scene's training.
         near_plane: minimum depth of drawn Gaussians, scene units; default as in gsplat.
         eps2d: added to the diagonal of each projected covariance, pixels^2; default as in 3DGS.
+        images: size of each image, C of them, if they differ; then ``width``, ``height`` and
+            ``eps2d`` follow from them. None if all images have one size.
 
     Raises:
-        DataError: if a shape does not match the others, or the image has no pixels.
+        DataError: if a shape does not match the others, or an image has no pixels.
 
     Example:
         >>> import torch
@@ -87,6 +111,7 @@ class Views:
     rasterize_mode: RasterizeMode = "classic"
     near_plane: float = NEAR_PLANE  # scene units
     eps2d: float = EPS2D  # pixels^2
+    images: Sequence[ImageSize] | None = None
 
     def __post_init__(self) -> None:
         tensors = isinstance(self.viewmats, Tensor) and self.viewmats.dim() > 0
@@ -104,16 +129,67 @@ class Views:
             found = tuple(value.shape)
             if found != shape:
                 raise DataError(f"{name} of the views has shape {found}; expected {shape}")
-        if self.width < 1 or self.height < 1:
-            raise DataError(
-                f"views are {self.width} x {self.height} pixels; expected at least 1 x 1"
-            )
+        if self.images is not None:
+            self._set_common_size([ImageSize(*size) for size in self.images])
+        for size in self.image_sizes():
+            if size.width < 1 or size.height < 1:
+                raise DataError(f"views are {size} pixels; expected at least 1 x 1")
+
+    def _set_common_size(self, images: list[ImageSize]) -> None:
+        if len(images) != len(self):
+            raise DataError(f"{len(images)} image sizes for {len(self)} views; expected one each")
+        counts = Counter(images)
+        common = (
+            max(counts, key=lambda size: (counts[size], size.width * size.height, size))
+            if images
+            else ImageSize(self.width, self.height, self.eps2d)
+        )
+        for name, value in zip(ImageSize._fields, common, strict=True):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "images", tuple(images) if len(counts) > 1 else None)
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]
 
     def __repr__(self) -> str:
-        return f"Views({len(self)} of {self.width} x {self.height} pixels, {self.rasterize_mode})"
+        return (
+            f"Views({len(self)} of {sizes_text(self.image_sizes())} pixels, {self.rasterize_mode})"
+        )
+
+    def image_sizes(self) -> list[ImageSize]:
+        """The different sizes of the images, most common first."""
+        if self.images is None:
+            return [ImageSize(self.width, self.height, self.eps2d)]
+        common = ImageSize(self.width, self.height, self.eps2d)
+        others = (size for size, _ in Counter(self.images).most_common())
+        return [common, *(size for size in others if size != common)]
+
+    def size_of_each(self) -> list[ImageSize]:
+        """The image size of each of the C views."""
+        if self.images is None:
+            return [ImageSize(self.width, self.height, self.eps2d)] * len(self)
+        return [*self.images]
+
+    def each_size(self, change: Callable[[Views], Views]) -> Views:
+        """The views after a change of their images, which is called for the views of each size.
+
+        Args:
+            change: changes intrinsics, image size and ``eps2d`` of views that have one size, and
+                keeps their number and order.
+        """
+        if self.images is None:
+            return change(self)
+        places: dict[ImageSize, list[int]] = {}
+        for place, size in enumerate(self.images):
+            places.setdefault(size, []).append(place)
+        Ks = self.Ks.clone()
+        images = [*self.images]
+        for of_size in places.values():
+            changed = change(self[of_size])
+            Ks[of_size] = changed.Ks
+            for place in of_size:
+                images[place] = ImageSize(changed.width, changed.height, changed.eps2d)
+        return replace(self, Ks=Ks, images=images)
 
     @overload
     def __getitem__(self, index: int) -> View: ...
@@ -129,16 +205,22 @@ class Views:
         """
         viewmats = self.viewmats[index]
         Ks = self.Ks[index]
-        kind = View if viewmats.dim() == 2 else Views
-        same = (
-            self.width,
-            self.height,
-            self.background,
-            self.rasterize_mode,
-            self.near_plane,
-            self.eps2d,
-        )
-        return kind(viewmats, Ks, *same)
+        single = viewmats.dim() == 2
+        size = ImageSize(self.width, self.height, self.eps2d)
+        images = None
+        if self.images is not None:
+            places = torch.arange(len(self), device="cpu")[
+                index.cpu() if isinstance(index, Tensor) else index
+            ]
+            images = [self.images[place] for place in places.view(-1).tolist()]
+            size = images[0] if single else size
+        same = {
+            "background": self.background,
+            "rasterize_mode": self.rasterize_mode,
+            "near_plane": self.near_plane,
+            **size._asdict(),
+        }
+        return View(viewmats, Ks, **same) if single else Views(viewmats, Ks, **same, images=images)
 
     def __iter__(self) -> Iterator[View]:
         return (self[index] for index in range(len(self)))
@@ -160,6 +242,8 @@ class Views:
 
     def resized(self, max_side: int) -> Views:
         """The views with the longer image side at most ``max_side`` pixels; never enlarges."""
+        if self.images is not None:
+            return self.each_size(lambda of_size: of_size.resized(max_side))
         factor = max_side / max(self.width, self.height)
         if factor >= 1:
             return self

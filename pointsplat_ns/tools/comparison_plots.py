@@ -20,7 +20,7 @@ from pointsplat_ns.rendering import render, render_with_alpha
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import spread_indices
 from pointsplat_ns.system.files import replacing
-from pointsplat_ns.tools.wording import STAGES, origin_text, quality_lines
+from pointsplat_ns.tools.wording import STAGES, origin_text, quality_lines, views_of_size
 
 
 @torch.no_grad()
@@ -105,10 +105,7 @@ def plot_views(dense: Gaussians, source: ViewProvider, path: Path | str) -> str:
     rows = [pictures[first : first + columns] for first in range(0, len(pictures), columns)]
     rows[-1] += [torch.ones_like(pictures[0])] * (columns - len(rows[-1]))
     side_by_side(rows, [""] * columns, path)
-    return (
-        f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; "
-        f"{origin_text(source.origin)}"
-    )
+    return f"{path}: {len(pictures)} of {views_of_size(views)}; {origin_text(source.origin)}"
 
 
 @torch.no_grad()
@@ -146,11 +143,13 @@ def plot_cleaning(done: Cleaned, path: Path | str) -> None:
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:
-    """Draw a grid of images (H, W, 3) of one size, in [0, 1], to a PNG file. Titles stand above the
-    columns and in the file's description. Raises SceneError if the file cannot be written."""
+    """Draw a grid of images (H, W, 3) in [0, 1] to a PNG file. Cells have the shape of the tallest
+    image. Titles stand above the columns and in the file's description. Raises SceneError if the
+    file cannot be written."""
     from matplotlib.figure import Figure
 
-    height, width = np.shape(rows[0][0])[:2]
+    shapes = [np.shape(image)[:2] for images in rows for image in images]
+    height, width = max(shapes, key=lambda shape: shape[0] / shape[1])
     panel = 16 / max(len(titles), 3)  # inches across
     size = (panel * len(titles), panel * len(rows) * height / width + 0.6)
     figure = Figure(figsize=size, layout="constrained")

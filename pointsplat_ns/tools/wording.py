@@ -22,7 +22,7 @@ from pointsplat_ns.pipeline.report import (
 )
 from pointsplat_ns.pipeline.view_provider import Origin, ViewOrigin
 from pointsplat_ns.rendering.comparison.closeness import LEAST_OPACITY, Closeness
-from pointsplat_ns.scene.views import Views
+from pointsplat_ns.scene.views import ImageSize, Views, sizes_text
 from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.tools.pages.watched_file import FileState
@@ -118,7 +118,8 @@ def quality_lines(quality: Quality) -> tuple[str, ...]:
 
 def quality_details(quality: Quality) -> str:
     """A line with further figures of a result."""
-    views = f"{views_text(quality.views)} of {quality.width} x {quality.height} pixels"
+    sizes = ImageSize(quality.width, quality.height), *quality.other_sizes
+    views = f"{views_text(quality.views)} of {sizes_text(sizes)} pixels"
     return f"in {views} ({origin_text(quality.origin)}), {decibels(quality.worst)} in the worst"
 
 
@@ -147,6 +148,7 @@ def quality_json(quality: Quality | None) -> dict[str, Any]:
         "views": quality.views,
         "width": quality.width,
         "height": quality.height,
+        "other_sizes": [size[:2] for size in quality.other_sizes],
         "origin": origin_text(quality.origin),
         "fill_before": quality.fill_before,
         "fill": quality.fill,
@@ -163,7 +165,7 @@ def views_text(count: int) -> str:
 
 def views_of_size(views: Views) -> str:
     """Number and size of views."""
-    return f"{views_text(len(views))} of {views.width} x {views.height} pixels"
+    return f"{views_text(len(views))} of {sizes_text(views.image_sizes())} pixels"
 
 
 def origin_text(origin: ViewOrigin | None) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.scene.views import Views
+from pointsplat_ns.scene.views import ImageSize, Views
 from pointsplat_ns.view_sampling.content import in_scene_units, views_in_units
 from pointsplat_ns.view_sampling.poses import around, whole_views
 from pointsplat_ns.view_sampling.sampler import Sampler
@@ -51,7 +51,8 @@ def opening_views(
         width: of the images, pixels, unless the views are known ones.
         height: of the images, pixels.
         up: up direction; by default declared by the scene, or estimated.
-        known: views chosen by people. Their size, background and rasterize mode apply to all views.
+        known: views chosen by people. Their most common size, background and rasterize mode apply
+            to a view from outside.
 
     Raises:
         DataError: if nothing of the scene is visible.
@@ -75,8 +76,10 @@ def opening_views(
             True,
         )
     taken = sampler.completing(likelihoods, shown & ~whole_shown[best], count - 1)
-    viewmats = torch.cat(
-        [outside.viewmats[best : best + 1], known.viewmats[taken].to(outside.viewmats)]
-    )
-    Ks = torch.cat([outside.Ks[best : best + 1], known.Ks[taken].to(outside.Ks)])
-    return Opening(replace(known, viewmats=viewmats, Ks=Ks), sampler.up, True)
+    first = outside[best : best + 1]
+    others = known[taken]
+    viewmats = torch.cat([first.viewmats, others.viewmats.to(outside.viewmats)])
+    Ks = torch.cat([first.Ks, others.Ks.to(outside.Ks)])
+    common = ImageSize(known.width, known.height, known.eps2d)
+    images = [common, *others.size_of_each()]
+    return Opening(replace(known, viewmats=viewmats, Ks=Ks, images=images), sampler.up, True)

@@ -243,7 +243,8 @@ class Sampler:
                 blur = max(float((pixels * widths / distances).double().sum()) / covered, 1e-9)
             shown = pixels > 0.02  # sum of blending weights
             share = (float(shown.sum()) + 1) / len(pixels)
-            empty = max(0.0, 1 - covered / (small.width * small.height))
+            view = small[index]
+            empty = max(0.0, 1 - covered / (view.width * view.height))
             return math.log(share) - math.log(empty + 0.01) - 2 * math.log(blur), shown
 
         likelihoods, shown = zip(

@@ -69,15 +69,22 @@ def test_near_plane_and_eps2d_go_to_nerfstudios_cameras_and_back(views, near_pla
         assert (again.near_plane, again.eps2d) == (near_plane, eps2d)
 
 
-def test_cameras_of_several_near_planes_or_sizes_are_refused(views):
+def test_cameras_of_several_near_planes_are_refused(views):
     cameras = cameras_of_views(views)
     cameras.metadata["near_plane"] = torch.tensor([[0.1], [0.1], [0.2]])
     with pytest.raises(DataError, match="2 values of near_plane; expected one for all views"):
         views_of_cameras(cameras, BACKGROUND)
+
+
+def test_sizes_of_each_view_go_to_nerfstudios_cameras_and_back():
     cameras = some_cameras()
     cameras.width = torch.tensor([[40], [41], [40]])
-    with pytest.raises(DataError, match="photos of 2 sizes; expected one size for all views"):
-        views_of_cameras(cameras, BACKGROUND)
+    cameras.height = torch.tensor([[30], [30], [60]])
+    views = views_of_cameras(cameras, BACKGROUND)
+    assert [(view.width, view.height) for view in views] == [(40, 30), (41, 30), (40, 60)]
+    again = cameras_of_views(views)
+    assert torch.equal(again.width, cameras.width) and torch.equal(again.height, cameras.height)
+    assert views_of_cameras(again, BACKGROUND).images == views.images
 
 
 def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):

@@ -18,10 +18,20 @@ from PIL import Image
 from refusing import fails
 
 import pointsplat_ns as ps
+from making import several_sizes
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices, viewmats_to_opengl
 from pointsplat_ns.scene.camera_files import camera_views as cameras
 from pointsplat_ns.scene.camera_files import is_camera_file, read_named_views
-from posing import inria, name_of, nerfstudio, write_colmap, write_sparse, written
+from posing import (
+    inria,
+    name_of,
+    nerfstudio,
+    nerfstudio_of_several_sizes,
+    write_colmap,
+    write_sparse,
+    write_sparse_of_several_sizes,
+    written,
+)
 
 
 def read_views(path: Path) -> ps.Views:
@@ -224,11 +234,16 @@ def test_focal_lengths_and_principal_point_of_each_model_of_colmap(
     assert K.diagonal()[:2].tolist() == [*focal] and K[:2, 2].tolist() == [*centre]
 
 
-def test_cameras_of_other_sizes_see_the_same_at_the_most_common_size(tmp_path):
-    content = inria(some_views(3, centred=True))
-    content[1].update(width=128, height=24, fx=100.0, fy=26.0)
-    found = read_views(written(content, tmp_path / "cameras.json"))
-    need_same(found, some_views(3, centred=True))
+@pytest.mark.parametrize("kind", ["cameras.json", "transforms.json", "colmap"])
+def test_each_camera_keeps_its_own_size(kind, tmp_path):
+    views = several_sizes(some_views(8, centred=True))
+    if kind == "colmap":
+        found = read_views(write_sparse_of_several_sizes(views, tmp_path / "sparse"))
+    else:
+        content = inria(views) if kind == "cameras.json" else nerfstudio_of_several_sizes(views)
+        found = read_views(written(content, tmp_path / kind))
+    need_same(found, views)
+    assert [size[:2] for size in found.size_of_each()] == [s[:2] for s in views.images]
 
 
 def inria_with(**changes) -> list:

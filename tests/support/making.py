@@ -2,6 +2,7 @@
 and what a file imports."""
 
 import ast
+import dataclasses
 import itertools
 import math
 import os
@@ -16,7 +17,7 @@ import torch
 
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.scene.gaussians import Gaussians
-from pointsplat_ns.scene.views import Views
+from pointsplat_ns.scene.views import ImageSize, Views
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.view_sampling.poses import look_at, views_of
 from pointsplat_ns.view_sampling.sampler import sample_views
@@ -374,6 +375,23 @@ def in_pictures(views: Views, points: torch.Tensor, min_depth: float = 0.0) -> t
     )  # x and y in pixels, times the depth: nothing is divided by it
     within = (x > 0) & (x < views.width * depth) & (y > 0) & (y < views.height * depth)
     return (depth > min_depth) & within
+
+
+def several_sizes(views: Views) -> Views:
+    """The same cameras, every third one held upright, and every fourth one with half as many
+    pixels a side: photos of two devices, one of them turned."""
+    images = []
+    Ks = views.Ks.clone()
+    for index in range(len(views)):
+        size = views.width, views.height
+        if index % 3 == 2:
+            size = size[::-1]
+            Ks[index, :2, 2] = Ks[index, :2, 2].flip(0)
+        if index % 4 == 3:
+            size = size[0] // 2, size[1] // 2
+            Ks[index, :2] *= 0.5
+        images.append(ImageSize(*size))
+    return dataclasses.replace(views, Ks=Ks, images=images)
 
 
 def views_from_within(

@@ -10,7 +10,7 @@ from pointsplat_ns.geometry.transforms import invert_rigid, viewmats_to_opengl
 from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import write_picture
-from pointsplat_ns.scene.views import Views
+from pointsplat_ns.scene.views import View, Views
 
 
 def name_of(index: int) -> str:
@@ -24,14 +24,14 @@ def inria(views: Views) -> list[dict]:
         {
             "id": index,
             "img_name": name_of(index),
-            "width": views.width,
-            "height": views.height,
+            "width": view.width,
+            "height": view.height,
             "position": pose[:3, 3].tolist(),
             "rotation": pose[:3, :3].tolist(),
-            "fy": float(K[1, 1]),
-            "fx": float(K[0, 0]),
+            "fy": float(view.K[1, 1]),
+            "fx": float(view.K[0, 0]),
         }
-        for index, (pose, K) in enumerate(zip(poses, views.Ks, strict=True))
+        for index, (pose, view) in enumerate(zip(poses, views, strict=True))
     ]
 
 
@@ -58,6 +58,19 @@ def nerfstudio(views: Views) -> dict:
         "camera_model": "OPENCV",
         "frames": frames,
     }
+
+
+def nerfstudio_of_several_sizes(views: Views) -> dict:
+    """The same with the intrinsics of each frame in the frame, as for several cameras."""
+    content = nerfstudio(views)
+    for frame, view in zip(content["frames"], views, strict=True):
+        own = nerfstudio(views_of_one(view))
+        frame |= {name: own[name] for name in ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1")}
+    return {"camera_model": "OPENCV", "frames": content["frames"]}
+
+
+def views_of_one(view: View) -> Views:
+    return Views(view.viewmat[None], view.K[None], view.width, view.height, view.background)
 
 
 def write_colmap(folder: Path, suffix: str, lens: tuple, poses: dict, seeds=(), colors=()) -> Path:
@@ -94,6 +107,23 @@ def write_sparse(
     return write_colmap(
         folder, suffix, lens, {name_of(index): viewmat for index, viewmat in enumerate(viewmats)}
     )
+
+
+def write_sparse_of_several_sizes(views: Views, folder: Path) -> Path:
+    """A model as COLMAP writes it, with one camera for each image."""
+    folder.mkdir(parents=True)
+    cameras = {}
+    images = {}
+    for index, view in enumerate(views):
+        K = view.K.tolist()
+        params = [K[0][0], K[1][1], K[0][2], K[1][2]]
+        cameras[index] = colmap.Camera(index, "PINHOLE", view.width, view.height, params)
+        viewmat = view.viewmat.double().numpy()
+        pose = colmap.rotmat2qvec(viewmat[:3, :3]), viewmat[:3, 3]
+        points = np.zeros((0, 2)), np.zeros(0)
+        images[index] = colmap.Image(index, *pose, index, name_of(index), *points)
+    colmap.write_model(cameras, images, {}, str(folder), ".bin")
+    return folder
 
 
 def write_photos(scene: Gaussians, views: Views, folder: Path) -> Path:

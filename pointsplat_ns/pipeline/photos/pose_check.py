@@ -168,10 +168,10 @@ def likeness(scene: Gaussians, photos: Sequence[Photo]) -> Likeness:
         taken.append(_standard(picture))
     own = [float((a * b).sum()) for a, b in zip(shown, taken, strict=True)]
     others = [
-        float((a * b).sum())
+        float((a * _shaped(b, a)).sum())
         for index, a in enumerate(shown)
         for other, b in enumerate(taken)
-        if index != other and a.shape == b.shape
+        if index != other
     ]
     count = len(own)
     return Likeness(
@@ -180,6 +180,13 @@ def likeness(scene: Gaussians, photos: Sequence[Photo]) -> Likeness:
         psnr=sum(psnrs) / max(1, count),
         count=count,
     )
+
+
+def _shaped(picture: Tensor, other: Tensor) -> Tensor:
+    """A picture of :func:`_standard`, stretched to the shape of another one."""
+    if picture.shape == other.shape:
+        return picture
+    return _standard(F.interpolate(picture[None], other.shape[1:], mode="area")[0])
 
 
 def _standard(picture: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ from pointsplat_ns.pruning.merging.regrouping import regrouped
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import Participants, State, drawable, initial_state
 from pointsplat_ns.pruning.merging.visibility import views_and_weights
-from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes, middle_side
+from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes, middle_size
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.memory import give_back_freed_memory
@@ -328,9 +328,7 @@ def _with_reference(step: Step, settings: MergeSettings) -> Step:
         )
     unit = everyone.centre, everyone.size
     views = views_in_units(views.spread(settings.finish_views), *unit)
-    return replace(
-        step, reference=RendersOfSizes(in_units(dense, *unit), views, [middle_side(views)])
-    )
+    return replace(step, reference=RendersOfSizes(in_units(dense, *unit), [middle_size(views)]))
 
 
 def _result(step: Step, regroup: bool, settings: MergeSettings) -> Merged:

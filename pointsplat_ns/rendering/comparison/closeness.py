@@ -36,7 +36,7 @@ class Closeness:
     covered: tuple[float, ...]
     """Share of the pixels that the dense scene covers, in [0, 1], for each view."""
     width: int | None = None
-    """Width of the images, pixels; None if unknown."""
+    """Width of the images, pixels; None if unknown, or if they have several sizes."""
 
     @property
     def psnr(self) -> float:
@@ -117,7 +117,8 @@ class Reference:
             errors.append(error)
             if progress is not None:
                 progress(len(errors) / len(self.renders))
-        return Closeness(tuple(errors), self.covered, self.views.width)
+        width = self.views.width if self.views.images is None else None
+        return Closeness(tuple(errors), self.covered, width)
 
 
 class DenseReference(Reference):

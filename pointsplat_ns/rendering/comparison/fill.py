@@ -38,4 +38,5 @@ def fill(scene: Gaussians, views: Views, max_count: int = 100_000) -> float:
         high = seen.means2d + half
         inside = (high.minimum(size) - low.clamp_min(0)).clamp_min(0) / (high - low)
         pixels += float((area * inside.prod(dim=1)).double().sum())
-    return pixels * len(scene) / max(len(sample), 1) / (len(views) * views.width * views.height)
+    drawn = sum(size.width * size.height for size in views.size_of_each())
+    return pixels * len(scene) / max(len(sample), 1) / drawn

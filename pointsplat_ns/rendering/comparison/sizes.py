@@ -10,7 +10,7 @@ large one at the cost of the small one.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -76,21 +76,21 @@ def sides_of(width: int, height: int) -> tuple[int, ...]:
 
 
 def middle_side(views: Views) -> int:
-    """The middle one of the :func:`sides_of` views, pixels."""
+    """The middle one of the :func:`sides_of` views of one size, pixels."""
     sides = sides_of(views.width, views.height)
     return sides[len(sides) // 2]
 
 
 def middle_sized(views: Views) -> Views:
     """Views at their :func:`middle_side`: similar to common viewing sizes, and quick to render."""
-    return views.resized(middle_side(views))
+    return views.each_size(lambda of_size: of_size.resized(middle_side(of_size)))
 
 
 def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
     """Every k-th pixel of images of another size, k = ``side / drawn_side``.
 
     Args:
-        views: C views of any size.
+        views: C views of one size.
         side: longer side of the full images, pixels. Larger than the views' own gives the images of
             a nearer camera.
         drawn_side: longer side of the rendered images, pixels; at most that of ``views``. By
@@ -105,35 +105,62 @@ def several_sizes(views: Views, drawn_side: int = SMALLEST_SIDE) -> tuple[Views,
     their full size, and :data:`NEARER` times that. By default, rendered images are no larger than
     the smallest, because many views help more than many pixels of few views. Without the third
     size, a garden gains 0.2 dB less at 1920 pixels, and the same at 960."""
-    whole = max(views.width, views.height)
-    sides = middle_side(views), whole, NEARER * whole
-    middle, full, nearer = (subsampled(views, side, min(side, whole, drawn_side)) for side in sides)
-    return middle, full, nearer
+
+    def of(side_of: Callable[[Views], int]) -> Views:
+        def drawn(views: Views) -> Views:
+            side = side_of(views)
+            return subsampled(views, side, min(side, longer_side(views), drawn_side))
+
+        return views.each_size(drawn)
+
+    return of(middle_side), of(longer_side), of(lambda views: NEARER * longer_side(views))
+
+
+def longer_side(views: Views) -> int:
+    """Longer side of the images of views of one size, pixels."""
+    return max(views.width, views.height)
+
+
+def middle_size(views: Views) -> Views:
+    """Views subsampled from images of their :func:`middle_side`."""
+    return views.each_size(lambda of_size: subsampled(of_size, middle_side(of_size)))
+
+
+def other_sizes(views: Views) -> list[Views]:
+    """Views subsampled from images of the sizes that :func:`middle_sized` leaves out: the smallest,
+    the full size, and :data:`NEARER` times that; empty if no image is larger than the smallest."""
+    if all(max(size[:2]) <= SMALLEST_SIDE for size in views.image_sizes()):
+        return []
+    return [
+        views.each_size(
+            lambda of_size: subsampled(of_size, min(SMALLEST_SIDE, longer_side(of_size)))
+        ),
+        views.each_size(lambda of_size: subsampled(of_size, longer_side(of_size))),
+        views.each_size(lambda of_size: subsampled(of_size, NEARER * longer_side(of_size))),
+    ]
 
 
 class RendersOfSizes:
-    """Renders of a dense scene, subsampled from images of several sizes, to compare renders of
-    other scenes with over two backgrounds.
+    """Renders of a dense scene in views of several sizes, to compare renders of other scenes with
+    over two backgrounds.
 
     Args:
         dense: N Gaussians.
-        views: C views of the scene.
-        sides: longer sides of the full images, pixels.
+        views: views of the scene for each size, such as from :func:`other_sizes`.
     """
 
     @torch.no_grad()
-    def __init__(self, dense: Gaussians, views: Views, sides: Sequence[int]):
-        drawn = [subsampled(views, side) for side in sides]
+    def __init__(self, dense: Gaussians, views: Sequence[Views]):
         self.references = [
-            DenseReference(dense, of_side, both_backgrounds=True) for of_side in drawn
+            DenseReference(dense, of_size, both_backgrounds=True) for of_size in views
         ]
-        """Renders of the dense scene, for each side."""
+        """Renders of the dense scene, for each size."""
 
     def psnrs(self, scene: Gaussians) -> list[float]:
-        """PSNR for each side, dB; at most :data:`~pointsplat_ns.metrics.MOST_PSNR`."""
+        """PSNR for each size, dB; at most :data:`~pointsplat_ns.metrics.MOST_PSNR`."""
         return [min(reference.psnr(scene)[0], MOST_PSNR) for reference in self.references]
 
     def psnr(self, scene: Gaussians) -> float:
-        """Mean of :meth:`psnrs` over the sides, dB."""
+        """Mean of :meth:`psnrs` over the sizes, dB."""
         found = self.psnrs(scene)
         return sum(found) / len(found)

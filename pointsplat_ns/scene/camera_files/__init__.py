@@ -30,6 +30,7 @@ from pointsplat_ns.scene.formats import SOG_META, STREAM_META, format_named
 from pointsplat_ns.scene.runs import RUN_FILES, may_be_run, read_transforms
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.files import logger, one_line, require_file, require_memory
+from pointsplat_ns.system.opening import open_regular
 
 CAMERA_KINDS = (
     "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model or "
@@ -103,8 +104,7 @@ def transforms_beside(path: Path | str) -> Path | None:
 def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedViews:
     """Read the cameras of a file.
 
-    Lens distortion is ignored; a warning is logged. Cameras of another image size than the most
-    common one get that size: same field of view, other focal lengths.
+    Lens distortion is ignored; a warning is logged. Each view has the image size of its camera.
 
     Args:
         path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json`` or its folder, or the
@@ -172,7 +172,8 @@ def _json_cameras(path: Path) -> CameraFile:
         )
     require_memory(path, 24 * size)  # worst case of memory per byte of JSON: empty lists
     try:
-        content = json.loads(path.read_bytes())
+        with open_regular(path) as stream:
+            content = json.loads(stream.read())
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(
             f"{path}: cannot be read as JSON ({one_line(error, 80)}); expected {CAMERA_KINDS}"

@@ -1,10 +1,9 @@
-"""Checks the cameras of a file and converts them to views of one size."""
+"""Checks the cameras of a file and converts them to views."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.scene.views import Views
+from pointsplat_ns.scene.views import ImageSize, Views
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 MOST_CAMERAS = 100_000
@@ -140,10 +139,7 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
 
 
 def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None) -> Views:
-    """Convert cameras to views with a black background.
-
-    All views have one size. Cameras of another size than the most common one keep their field of
-    view: their intrinsics are stretched to that size, width and height separately.
+    """Convert cameras to views with a black background, each with the image size of its camera.
 
     Args:
         path: camera file, for error messages.
@@ -182,13 +178,13 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None) 
             raise DataError(
                 f"{path}: camera {camera} {what}; expected {expected}; correct it or leave it out"
             )
-    counts = Counter((int(width), int(height)) for width, height in sizes.tolist())
-    width, height = max(counts, key=lambda size: (counts[size], size[0] * size[1]))
-    stretch = sizes.new_tensor([width, height]) / sizes
+    images = [ImageSize(width, height) for width, height in sizes.long().tolist()]
     Ks = torch.eye(3, **DOUBLES).repeat(len(cameras), 1, 1)
-    Ks[:, [0, 1], [0, 1]] = focals * stretch
-    Ks[:, :2, 2] = centres * stretch
-    return Views(invert_rigid(poses), Ks, width, height, torch.zeros(3, **FLOATS))
+    Ks[:, [0, 1], [0, 1]] = focals
+    Ks[:, :2, 2] = centres
+    background = torch.zeros(3, **FLOATS)
+    size = images[0]
+    return Views(invert_rigid(poses), Ks, size.width, size.height, background, images=images)
 
 
 def photo_file(folders: Sequence[Path], name: str) -> Path | None:

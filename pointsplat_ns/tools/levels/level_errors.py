@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from torch.nn.functional import avg_pool2d
 from pointsplat_ns.rendering import render_depth
 from pointsplat_ns.rendering.comparison.closeness import Reference
 from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.tensors import DOUBLES
 
 ENOUGH = 30.0
@@ -77,18 +79,22 @@ def far_references(reference: Reference) -> dict[int, Reference]:
     views = reference.views
     references = {}
     for times in (2, 4, 8):
-        if times > min(views.width, views.height):
+        if times > min(min(size[:2]) for size in views.image_sizes()):
             continue
-        shrink = views.Ks.new_tensor([[1 / times], [1 / times], [1.0]])
-        smaller = replace(
-            views, Ks=views.Ks * shrink, width=views.width // times, height=views.height // times
-        )
+        smaller = views.each_size(functools.partial(_reduced, times=times))
         targets = [
             avg_pool2d(image.double().permute(2, 0, 1), times).permute(1, 2, 0)
             for image in reference.renders
         ]
         references[times] = Reference(smaller, targets, reference.covered)
     return references
+
+
+def _reduced(views: Views, times: int) -> Views:
+    """Views of one size whose pixels are squares of ``times`` x ``times`` pixels."""
+    shrink = views.Ks.new_tensor([[1 / times], [1 / times], [1.0]])
+    size = views.width // times, views.height // times
+    return replace(views, Ks=views.Ks * shrink, width=size[0], height=size[1])
 
 
 @torch.no_grad()

@@ -170,6 +170,7 @@ class Levels:
                 "origin": origin_text(self.origin),
                 "width": views.width,
                 "height": views.height,
+                "other_sizes": [size[:2] for size in views.image_sizes()[1:]],
             }
         source = {
             "file": file and file.name,

@@ -161,7 +161,10 @@ def toured(views: Views) -> Views:
 
 
 def fitted(views: Views, width: int, height: int) -> Views:
-    """The same cameras with pictures of another size. The vertical field of view stays."""
+    """The same cameras with pictures of another size, one for all. The vertical field of view
+    stays."""
+    if views.images is not None:
+        return views.each_size(lambda of_size: fitted(of_size, width, height))
     factor = height / views.height
     Ks = views.Ks.double() * factor
     Ks[:, 0, 2] = width / 2 + (views.Ks[:, 0, 2].double() - views.width / 2) * factor

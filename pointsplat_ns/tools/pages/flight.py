@@ -91,9 +91,9 @@ class FlightFrame:
     def data(self, packed: Sequence[dict[str, str]]) -> dict[str, Any]:
         """Data for ``flight.js`` from results of :meth:`packed` for one or two scenes, the left one
         first."""
-        fov = 2 * torch.atan(
-            0.5 * max(self.views.width, self.views.height) / self.views.Ks[:, 0, 0].abs()
-        )
+        sizes = self.views.size_of_each()
+        longer = self.views.Ks.new_tensor([max(size.width, size.height) for size in sizes])
+        fov = 2 * torch.atan(0.5 * longer / self.views.Ks[:, 0, 0].abs())
         eyes = invert_rigid(self.views.viewmats)[:, :3, 3]
         return {
             "scenes": list(packed),
@@ -101,16 +101,17 @@ class FlightFrame:
                 {
                     "eye": eye,
                     "fov": angle,
+                    "aspect": size.width / size.height,
                     **dict(zip(("right", "down", "ahead"), viewmat[:3], strict=False)),
                 }
-                for eye, angle, viewmat in zip(
+                for eye, angle, size, viewmat in zip(
                     eyes.tolist(),
                     fov.tolist(),
+                    sizes,
                     self.views.viewmats[:, :3, :3].tolist(),
                     strict=True,
                 )
             ],
-            "aspect": self.views.width / self.views.height,
             "up": self.up.direction.tolist(),
             "sure": self.up.sure,
             "near": self.views.near_plane,

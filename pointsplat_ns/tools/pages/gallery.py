@@ -46,8 +46,8 @@ def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Pa
     view of its page. ``known`` are its views, if any. Raises DataError if nothing of the scene is
     visible, and SceneError if the file cannot be written."""
     frame = FlightFrame.of(before, known)
-    views = frame.views.resized(WIDTH)
-    view = views.resized(round(max(views.width, views.height) * min(1.0, HEIGHT / views.height)))[0]
+    first = frame.views[:1].resized(WIDTH)
+    view = first.resized(round(max(first.width, first.height) * min(1.0, HEIGHT / first.height)))[0]
     pair = torch.zeros(HEIGHT, 2 * WIDTH, 3, **FLOATS)
     top = (HEIGHT - view.height) // 2
     left = (WIDTH - view.width) // 2

@@ -17,7 +17,7 @@ from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
 from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import name_of
-from pointsplat_ns.scene.views import spread_indices
+from pointsplat_ns.scene.views import ImageSize, sizes_text, spread_indices
 from pointsplat_ns.system.files import bytes_text, need_folder, need_new, replacing, three_digits
 from pointsplat_ns.system.outputs import outputs_claimed
 from pointsplat_ns.system.progress import Progress, progress_bar
@@ -205,6 +205,7 @@ class _Measuring:
             judged_in=views_of_size(measurer.judge.views),
             width=measurer.judged.views.width,
             height=measurer.judged.views.height,
+            other_sizes=tuple(measurer.judged.views.image_sizes()[1:]),
             points=tuple(self.points),
             notes=tuple(filter(None, (busy, measurer.note, note))),
             recommended=best.key,
@@ -230,6 +231,7 @@ def write_page(found: Tradeoff, pictures: Sequence[dict[str, str]], output: Path
         "tradeoff.html",
         ("tradeoff.js",),
         found=found,
+        sizes=sizes_text([ImageSize(found.width, found.height), *found.other_sizes]),
         photos=dense.against_photos is not None,
         shown=shown,
         word_for=impression,

@@ -6,6 +6,7 @@ of the dense scene in the same view: both slow down alike, and the ratio of thei
 
 from __future__ import annotations
 
+import functools
 import platform
 import re
 from collections.abc import Sequence
@@ -24,10 +25,10 @@ from pointsplat_ns.pipeline.quality import Judge
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.rendering import render
-from pointsplat_ns.rendering.comparison.sizes import middle_sized
+from pointsplat_ns.rendering.comparison.sizes import longer_side, middle_sized
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.image_files import in_unit_range
-from pointsplat_ns.scene.views import View, Views, spread_indices
+from pointsplat_ns.scene.views import ImageSize, View, Views, sizes_text, spread_indices
 from pointsplat_ns.system.cores import OtherPrograms, cores
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.threads import most_threads, now
@@ -40,7 +41,7 @@ ROUNDS = 3
 
 
 class JudgedViews(NamedTuple):
-    """Views to draw and time, their photos of the same size in [0, 1], if any, and a text on their
+    """Views to draw and time, their photos of the same sizes in [0, 1], if any, and a text on their
     origin."""
 
     views: Views
@@ -56,10 +57,8 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
     note = ""
     if subject.held_out is not None:
         try:
-            views, photos, note = photos_of_one_size(subject.held_out(), count)
-            whole = views if subject.resolution is None else views.resized(max(subject.resolution))
-            middle = middle_sized(whole)
-            small = views.resized(max(middle.width, middle.height))
+            views, photos = photos_with_views(subject.held_out(), count)
+            small = views.each_size(functools.partial(_middle_sized, most=subject.resolution))
             if small is not views:
                 photos = [_averaged(photo, view) for photo, view in zip(photos, small, strict=True)]
             origin = f"held-out photos of {subject.photos or 'the dataset'}"
@@ -71,24 +70,34 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
     return JudgedViews(views, None, origin_text(source.origin)), note
 
 
-def photos_of_one_size(photos: Photos, count: int) -> tuple[Views, list[Example], str]:
-    """At most ``count`` photos of one size, their views, and a note on photos of other sizes."""
+def _middle_sized(views: Views, most: tuple[int, int] | None) -> Views:
+    """Views of one size, reduced to the middle size of at most ``most`` pixels."""
+    whole = views if most is None else views.resized(max(most))
+    return views.resized(longer_side(middle_sized(whole)))
+
+
+def photos_with_views(photos: Photos, count: int) -> tuple[Views, list[Example]]:
+    """Views of at most ``count`` photos, and these photos in [0, 1]. Raises DataError if there is
+    no photo."""
     shown = [photos[index] for index in spread_indices(len(photos), count)]
     if not shown:
         raise DataError("there is no held-out photo")
-    sizes = [example.target.shape for example in shown]
-    size = max(sizes, key=sizes.count)
-    of_size = [example for example in shown if example.target.shape == size]
-    first = of_size[0].view
+    first = shown[0].view
     viewmats, Ks = (
-        torch.stack(mats)
-        for mats in zip(*((s.view.viewmat, s.view.K) for s in of_size), strict=True)
+        torch.stack(mats) for mats in zip(*((s.view.viewmat, s.view.K) for s in shown), strict=True)
     )
-    views = Views(viewmats, Ks, first.width, first.height, first.background, first.rasterize_mode)
-    others = len(shown) - len(of_size)
-    note = f"{others} of {len(shown)} held-out photos have another size: skipped" if others else ""
-    floats = [example._replace(target=in_unit_range(example.target).float()) for example in of_size]
-    return views, floats, note
+    views = Views(
+        viewmats,
+        Ks,
+        first.width,
+        first.height,
+        first.background,
+        first.rasterize_mode,
+        images=[ImageSize(example.view.width, example.view.height) for example in shown],
+    )
+    return views, [
+        example._replace(target=in_unit_range(example.target).float()) for example in shown
+    ]
 
 
 def _averaged(photo: Example, view: View) -> Example:
@@ -119,8 +128,8 @@ class Measurer:
         self.judge = Judge(self.dense, subject.new_views())
         self.judged, self.note = views_to_judge(subject, views)
         shown = self.judged.views
-        if min(shown.width, shown.height) < SSIM_WINDOW:
-            size = f"{shown.width} x {shown.height} pixels"
+        if min(min(size[:2]) for size in shown.image_sizes()) < SSIM_WINDOW:
+            size = f"{sizes_text(shown.image_sizes())} pixels"
             raise DataError(f"views are {size}; expected at least {SSIM_WINDOW} per side")
 
     def point(self, setting: Setting, scene: Gaussians, seconds: float, show: Progress) -> Point:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 from pointsplat_ns.pipeline.repair_budget import Effort
+from pointsplat_ns.scene.views import ImageSize
 from pointsplat_ns.system.files import write_json
 
 Repair = Literal["none", "quick", "thorough", "photos"]
@@ -112,7 +113,7 @@ class Tradeoff:
     """Number and size of the judge's views, as text."""
     width: int
     height: int
-    """Size of the pictures, in pixels."""
+    """Size of the pictures, in pixels; the most common one, if there are several."""
     points: tuple[Point, ...]
     notes: tuple[str, ...]
     """Notes for the reader, such as on a busy machine."""
@@ -120,6 +121,8 @@ class Tradeoff:
     """``key`` of the recommended point."""
     why: str
     """Reason for the recommendation, as text."""
+    other_sizes: tuple[ImageSize, ...] = ()
+    """Sizes of the pictures that are not of the most common one."""
 
     def point(self, key: str) -> Point:
         """The point with a key. Raises KeyError if there is no such point."""

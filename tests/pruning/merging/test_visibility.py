@@ -11,7 +11,7 @@ from pointsplat_ns.pruning.merging import MERGING, visibility
 from pointsplat_ns.pruning.merging.groups import best_size_change, top_of_parabola
 from pointsplat_ns.pruning.merging.state import Participants
 from pointsplat_ns.pruning.merging.visibility import covered_per_area, views_and_weights
-from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes, sides_of
+from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.view_sampling.poses import look_at
@@ -141,7 +141,8 @@ def test_the_top_of_a_parabola_within_margins_or_else_the_best_trial(at, values,
 @pytest.mark.parametrize("change", [-0.08, 0.03])
 def test_the_size_change_that_undoes_a_known_one_is_found(change):
     dense = ball(500)
-    reference = RendersOfSizes(dense, sample_views(dense, 3, width=96, height=72), sides_of(96, 72))
+    views = sample_views(dense, 3, width=96, height=72)
+    reference = RendersOfSizes(dense, [views])
 
     def psnr_of(trial: float) -> float:
         return reference.psnr(dense.replace(scales=dense.scales + trial - change))

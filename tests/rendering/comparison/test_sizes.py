@@ -44,7 +44,7 @@ def test_a_subsampled_picture_is_every_so_many_th_pixel_of_the_large_one(scene, 
 
 
 def test_the_scene_itself_is_not_wrong_at_any_size_and_a_wider_one_is(scene, views):
-    renders = RendersOfSizes(scene, views, sides_of(640, 480))
+    renders = RendersOfSizes(scene, [subsampled(views, side) for side in sides_of(640, 480)])
     assert renders.psnrs(scene) == [100.0] * 3
     wider = renders.psnrs(scene.replace(scales=scene.scales + 0.1))
     assert all(5 < psnr < 60 for psnr in wider)
@@ -56,7 +56,7 @@ def test_an_error_of_opacity_alone_counts_on_some_background(scene, views):
     black = scene.replace(
         features_dc=torch.full_like(scene.features_dc, -10.0), features_rest=scene.features_rest * 0
     )
-    renders = RendersOfSizes(black, views, sides_of(640, 480))
+    renders = RendersOfSizes(black, [subsampled(views, side) for side in sides_of(640, 480)])
     assert renders.psnr(black.replace(opacities=black.opacities - 1)) < 50
 
 

@@ -161,7 +161,7 @@ def test_flight_begins_with_the_whole_and_leads_to_given_views():
     assert torch.allclose(torch.tensor(near["ahead"]), torch.tensor([-1.0, 0.0, 0.0]))
     expected = (torch.tensor([2.0, 0.0, 0.0]) - stage.centre) * 10 / stage.size
     assert torch.allclose(torch.tensor(near["eye"]), expected.float(), atol=1e-4)
-    assert near["fov"] == pytest.approx(2 * math.atan(32 / 60), rel=1e-6) and data["aspect"] == 1.6
+    assert near["fov"] == pytest.approx(2 * math.atan(32 / 60), rel=1e-6) and near["aspect"] == 1.6
     assert data["antialiased"] is True and data["background"] == [1.0, 0.5, 0.0]
     assert data["near"] == pytest.approx(0.01 * 10 / stage.size)
 

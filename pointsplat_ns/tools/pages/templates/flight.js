@@ -141,7 +141,7 @@ class Flight {
 
   // The field of view along the longer side of the stage, in which all of a view's picture is seen.
   fitted(index) {
-    const { aspect, views } = this.data, reach = Math.tan(0.5 * views[index].fov);
+    const { aspect, fov } = this.data.views[index], reach = Math.tan(0.5 * fov);
     const wide = this.canvas.clientWidth / this.canvas.clientHeight || aspect;
     const height = Math.max(reach * Math.min(1, 1 / aspect), (reach * Math.min(1, aspect)) / wide);
     return 2 * Math.atan(height * Math.max(1, wide));
