@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetpp, ScanNetppDataParserConfig
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
@@ -20,7 +21,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import flip_camera_axes
 from pointsplat_ns.nerfstudio_plugin.console import log
 from pointsplat_ns.system.files import read_text
-from pointsplat_ns.system.tensors import INDICES
+from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 SOURCES = (
     (
@@ -87,7 +88,7 @@ class SeededScanNetpp(ScanNetpp):
         try:
             with tempfile.TemporaryDirectory() as folder:  # the base class reads a file
                 completed = Path(folder) / "transforms.json"
-                completed.write_text(json.dumps(meta))
+                completed.write_text(json.dumps({**_intrinsics(meta["frames"][:1]), **meta}))
                 self.config = dataclasses.replace(located, transforms_path=completed)
                 outputs = super()._generate_dataparser_outputs(split)
         finally:
@@ -113,6 +114,9 @@ class SeededScanNetpp(ScanNetpp):
             if outputs.mask_filenames is not None:
                 outputs.mask_filenames = [outputs.mask_filenames[i] for i in kept]
             outputs.cameras = outputs.cameras[torch.tensor(kept, **INDICES)]
+        shown = [frames[str(path.relative_to(photos))] for path in outputs.image_filenames]
+        if _intrinsics(shown):
+            outputs.cameras = _of_several_cameras(outputs.cameras, shown, meta, located)
         if split == "train" and self.config.load_seed_points:
             model = located.data / located.colmap_path
             points = list(_read(model, "points3D").values()) if model.is_dir() else []
@@ -134,6 +138,47 @@ class SeededScanNetpp(ScanNetpp):
                 np.array([p.rgb for p in points], dtype=np.uint8)
             )
         return outputs
+
+
+INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")
+"""Names of intrinsics and distortion in a transforms file, in nerfstudio's order."""
+
+
+def _intrinsics(frames: list[dict[str, Any]]) -> dict[str, Any]:
+    """Intrinsics that frames have of their own, as those of several cameras do; of each the first
+    one found."""
+    return {name: frame[name] for name in INTRINSICS for frame in reversed(frames) if name in frame}
+
+
+def _of_several_cameras(
+    cameras: Cameras,
+    frames: list[dict[str, Any]],
+    meta: dict[str, Any],
+    config: SeededScanNetppDataParserConfig,
+) -> Cameras:
+    """Cameras (C,) with the intrinsics of their frames, or else those of all frames. Raises
+    DataError if a frame has none."""
+    try:
+        said = [
+            [float(frame.get(name, meta.get(name, 0.0))) for name in INTRINSICS] for frame in frames
+        ]
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DataError(
+            f"{config.data / config.transforms_path}: {error}; expected intrinsics that are numbers"
+        ) from error
+    numbers = torch.tensor(said, **FLOATS)
+    fx, fy, cx, cy, width, height = numbers[:, :6].split(1, dim=1)
+    return Cameras(
+        cameras.camera_to_worlds,
+        fx,
+        fy,
+        cx,
+        cy,
+        width.long(),
+        height.long(),
+        distortion_params=numbers[:, 6:],
+        camera_type=cameras.camera_type,
+    )
 
 
 def _located(config: SeededScanNetppDataParserConfig) -> SeededScanNetppDataParserConfig:

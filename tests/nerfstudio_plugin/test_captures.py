@@ -110,6 +110,36 @@ def test_a_scene_starts_from_the_points_of_the_capture(opened):
 TRANSFORMS = "dslr/nerfstudio/transforms.json"
 
 
+@pytest.mark.parametrize("common", [True, False])
+def test_photos_of_several_cameras_of_scannetpp_show_what_their_cameras_see(
+    common, wall_config, tmp_path
+):
+    folder = Capture(FISHEYE).write_scannetpp(tmp_path / "data")
+    meta = json.loads((folder / TRANSFORMS).read_text())
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4")
+    for index, frame in enumerate((*meta["frames"], *meta["test_frames"])):
+        if index % 2 and common:
+            continue  # of the camera of all frames
+        cut = 0 if index % 2 else 12  # columns that a second camera does not have
+        frame |= {name: meta[name] for name in names}
+        frame |= {"w": meta["w"] - cut, "cx": meta["cx"] - cut}
+        for place in ("resized_images", "resized_anon_masks"):
+            path = str(folder / "dslr" / place / frame["file_path"])
+            cv2.imwrite(path, cv2.imread(path)[:, cut:])
+    if not common:
+        for name in names:
+            del meta[name]
+    (folder / TRANSFORMS).write_text(json.dumps(meta))
+    config = wall_config(folder, tmp_path / "outputs", 1)
+    config.pipeline.datamanager.dataparser = SeededScanNetppDataParserConfig()
+    manager = config.pipeline.setup(device="cpu", test_mode="val").datamanager
+    frames = [*manager.train_frames, *manager.fixed_indices_eval_dataloader]
+    assert len(frames) == FRAMES - len(BAD)
+    assert len({data["image"].shape for _, data in frames}) == 2
+    outputs = manager.train_dataparser_outputs
+    assert all(wrongness(frame, outputs) < 0.002 for frame in frames)
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
     return Capture(FISHEYE).write_scannetpp(tmp_path_factory.mktemp("scannetpp") / "0a5c013435")
