@@ -125,7 +125,7 @@ def test_photos_of_several_cameras_of_scannetpp_show_what_their_cameras_see(
         frame |= {"w": meta["w"] - cut, "cx": meta["cx"] - cut}
         for place in ("resized_images", "resized_anon_masks"):
             path = str(folder / "dslr" / place / frame["file_path"])
-            cv2.imwrite(path, cv2.imread(path)[:, cut:])
+            cv2.imwrite(path, cv2.imread(path, cv2.IMREAD_UNCHANGED)[:, cut:])
     if not common:
         for name in names:
             del meta[name]
