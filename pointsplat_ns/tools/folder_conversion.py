@@ -75,10 +75,10 @@ def convert_folder(
         >>> result.name, result.status, result.before, result.after
         ('hall', 'done', 629, 629)
     """
-    kind = format_named(target_format if target_format.startswith(".") else f".{target_format}")
-    if kind is None or kind.write is None:
+    suffix = target_format if target_format.startswith(".") else f".{target_format}"
+    if format_named(suffix) is None:
         raise SceneError(f"--to {target_format}: not a format to write; expected {WRITABLE}")
-    format_to_write(kind.suffix, spz_version)  # refuses unknown versions
+    kind = format_to_write(suffix, spz_version)
     folder = Path(folder)
     target = (
         output_folder(folder, kind.suffix.removeprefix(".")) if output is None else Path(output)

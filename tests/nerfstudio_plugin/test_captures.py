@@ -117,15 +117,16 @@ def test_photos_of_several_cameras_of_scannetpp_show_what_their_cameras_see(
     folder = Capture(FISHEYE).write_scannetpp(tmp_path / "data")
     meta = json.loads((folder / TRANSFORMS).read_text())
     names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4")
+    width = meta["w"]
     for index, frame in enumerate((*meta["frames"], *meta["test_frames"])):
         if index % 2 and common:
             continue  # of the camera of all frames
-        cut = 0 if index % 2 else 12  # columns that a second camera does not have
+        cut = 0 if index % 2 else 6  # columns on both sides that a second camera does not have
         frame |= {name: meta[name] for name in names}
-        frame |= {"w": meta["w"] - cut, "cx": meta["cx"] - cut}
+        frame |= {"w": meta["w"] - 2 * cut, "cx": meta["cx"] - cut}
         for place in ("resized_images", "resized_anon_masks"):
             path = str(folder / "dslr" / place / frame["file_path"])
-            cv2.imwrite(path, cv2.imread(path, cv2.IMREAD_UNCHANGED)[:, cut:])
+            cv2.imwrite(path, cv2.imread(path, cv2.IMREAD_UNCHANGED)[:, cut : width - cut])
     if not common:
         for name in names:
             del meta[name]
@@ -137,7 +138,8 @@ def test_photos_of_several_cameras_of_scannetpp_show_what_their_cameras_see(
     assert len(frames) == FRAMES - len(BAD)
     assert len({data["image"].shape for _, data in frames}) == 2
     outputs = manager.train_dataparser_outputs
-    assert all(wrongness(frame, outputs) < 0.002 for frame in frames)
+    wrong = [wrongness(frame, outputs) for frame in frames]
+    assert max(wrong) < 0.002, wrong
 
 
 @pytest.fixture(scope="module")
