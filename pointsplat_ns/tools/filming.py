@@ -158,7 +158,7 @@ def open_viewer(
     """
     from pointsplat_ns.tools.pages.slider_scenes import ViewedScene
     from pointsplat_ns.tools.pages.viewer import Viewer
-    from pointsplat_ns.tools.pages.watched_file import WatchedFile
+    from pointsplat_ns.tools.watched_file import WatchedFile
 
     upward = up_named(up)
 

@@ -25,7 +25,7 @@ from pointsplat_ns.rendering.comparison.closeness import LEAST_OPACITY, Closenes
 from pointsplat_ns.scene.views import ImageSize, Views, sizes_text
 from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.system.quantities import counted
-from pointsplat_ns.tools.pages.watched_file import FileState
+from pointsplat_ns.tools.watched_file import FileState
 
 logger = logging.getLogger("pointsplat_ns")
 

@@ -18,7 +18,7 @@ from pointsplat_ns.pruning.merging import Merger
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.usable import keep_usable
 from pointsplat_ns.system.files import one_line
-from pointsplat_ns.tools.pages.watched_file import WatchedFile
+from pointsplat_ns.tools.watched_file import WatchedFile
 
 
 @dataclass(eq=False)

@@ -11,7 +11,7 @@ import pytest
 import pointsplat_ns as ps
 from making import ball, run_of
 from pointsplat_ns.tools.pages.viewer import Viewer
-from pointsplat_ns.tools.pages.watched_file import FileState, WatchedFile
+from pointsplat_ns.tools.watched_file import FileState, WatchedFile
 
 pytestmark = pytest.mark.usefixtures("quick")
 
