@@ -13,6 +13,7 @@ from pointsplat_ns.api import example_room
 from pointsplat_ns.geometry.transforms import direction_of
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene
+from pointsplat_ns.tools.pages.flight import FlightFrame
 from pointsplat_ns.tools.scene_info import info
 from pointsplat_ns.view_sampling import upright
 from pointsplat_ns.view_sampling.content import thinned
@@ -150,6 +151,7 @@ def test_a_declared_axis_that_the_scene_contradicts_is_doubted_once(make, right,
     assert Sampler(make().replace(up=wrong), up=Up(direction_of(wrong))).up.sure
     found = info(make().replace(up=wrong))
     assert (found.up_instead, found.up_text) == (right, str(up))
+    assert FlightFrame.of(make().replace(up=wrong)).up.instead == right
 
 
 @pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the files are not there")

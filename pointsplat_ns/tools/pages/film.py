@@ -20,7 +20,7 @@ from pointsplat_ns.tools.pages.image_encoding import to_uint8, with_labels
 from pointsplat_ns.tools.wording import missing_text, origin_text
 from pointsplat_ns.view_sampling.opening_views import opening_views
 from pointsplat_ns.view_sampling.poses import look_at
-from pointsplat_ns.view_sampling.upright import Up, known_up
+from pointsplat_ns.view_sampling.upright import Up
 
 MOST_FRAMES = 100_000
 """Maximum number of cameras."""
@@ -77,7 +77,6 @@ def camera_path(
     Raises:
         DataError: if there are no views.
     """
-    up = known_up(up, scene)
     known = source.known(MOST_FRAMES)
     seconds = 10.0 if settings.seconds is None else settings.seconds
     frames = 1 if one else min(max(round(seconds * settings.fps), 1), MOST_FRAMES)

@@ -26,7 +26,7 @@ from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.view_sampling.content import content_size, in_units, views_in_units
 from pointsplat_ns.view_sampling.opening_views import opening_views
 from pointsplat_ns.view_sampling.sampler import Sampler
-from pointsplat_ns.view_sampling.upright import Up, known_up
+from pointsplat_ns.view_sampling.upright import Up
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -56,8 +56,7 @@ class FlightFrame:
         and DataError if none is visible."""
         need_usable(scene)
         known = None if views is None or len(views) == 0 else views.spread(VIEW_COUNTS.opening)
-        up = known_up(up, scene)
-        if up is None and known is not None:
+        if up is None and scene.up is None and known is not None:
             up = _up_of(known, Sampler(scene).up)
         opening = opening_views(scene.detach(), 6, up=up, known=known)
         centre, size = content_size(scene)
