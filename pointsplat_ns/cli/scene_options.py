@@ -88,7 +88,7 @@ def output_beside(scene: Path, name: str, suffix: str | None = None) -> Path:
     The result of a file is beside it: ``room_pruned.ply`` for ``room.ply``. The result of a run is
     in its folder: ``pruned.ply``; never in the folder of checkpoints, because nerfstudio takes all
     files there for checkpoints. The path is automatic, so a symbolic link there is not followed."""
-    from pointsplat_ns.scene.formats import format_like
+    from pointsplat_ns.scene.formats import format_like, format_named
     from pointsplat_ns.system.outputs import unnamed
 
     name = f"{name}{format_like(scene).suffix if suffix is None else suffix}"
@@ -98,7 +98,9 @@ def output_beside(scene: Path, name: str, suffix: str | None = None) -> Path:
         return unnamed(scene.absolute().parents[1] / name)
     if scene.suffix.lower() in (".yml", ".yaml"):
         return unnamed(scene.with_name(name))
-    return unnamed(scene.with_name(f"{scene.stem.removesuffix('.compressed')}_{name}"))
+    known = format_named(scene.name)
+    ending = known.suffix if known is not None and known.suffix.startswith(".") else scene.suffix
+    return unnamed(scene.with_name(f"{scene.name[: len(scene.name) - len(ending)]}_{name}"))
 
 
 def need_scenes(*paths: Path | None) -> None:

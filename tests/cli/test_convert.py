@@ -19,7 +19,9 @@ def scene(tmp_path):
     return tmp_path / "a.ply"
 
 
-@pytest.mark.parametrize("name", ["a.spz", "folder/a.sog", "a.splat"])
+@pytest.mark.parametrize(
+    "name", ["a.spz", "folder/a.sog", "a.splat", "a.glb", "a.gltf", "a.spz.glb"]
+)
 def test_convert_writes_what_the_name_says_and_prints_its_size(scene, tmp_path, capsys, name):
     run("convert", scene, tmp_path / name)
     said = capsys.readouterr().out

@@ -1,6 +1,7 @@
 """glTF with Gaussians: what is written, read back; and what other programs may write."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ from refusing import fails
 
 import pointsplat_ns as ps
 from making import cloud, normal_scene
+from pointsplat_ns.cli.scene_options import output_beside
 from pointsplat_ns.geometry.harmonics import basis_rows
 from pointsplat_ns.geometry.transforms import direction_of, rotation_matrices
 from pointsplat_ns.scene.discovery import find_scenes
 from pointsplat_ns.scene.reading import kind_of, source_file
 
+CASES = Path(__file__).parent / "cases"
 SCENE = cloud(40, 3, 3)
 
 
@@ -431,3 +434,30 @@ def test_a_mesh_among_scenes_is_passed_over(tmp_path, caplog):
     ps.save(normal_scene(5, 0), tmp_path / "small.spz.glb")
     assert [*find_scenes(tmp_path)] == ["room", "small"]
     assert "mesh.glb: no Gaussians in it" in caplog.text
+
+
+def test_what_splat_transform_writes_is_read_right():
+    """It takes a PLY to have -y up, and turns it about z."""
+    room = ps.example_room()[::600]
+    back = ps.load(CASES / "splat_transform.glb")
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+    order = torch.cdist(back.means.double(), room.means.double() @ half_turn).argmin(dim=1)
+    assert sorted(order.tolist()) == list(range(len(room)))
+    same_after(back, room[order], half_turn, torch.zeros(3))
+    assert back.up == "y"
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf", ".spz.glb"])
+def test_a_budget_in_bytes_is_kept(tmp_path, suffix):
+    room = ps.example_room()[::20]
+    keep = f"0.06MB{suffix}"
+    small = ps.prune(room, keep=keep, by="coverage")
+    ps.save(small, tmp_path / f"a{suffix}")
+    size = (tmp_path / f"a{suffix}").stat().st_size
+    assert 0.9 * 60_000 < size <= 60_000
+
+
+@pytest.mark.parametrize("name", ["room.glb", "room.spz.glb", "room.gltf"])
+def test_results_are_beside_a_scene_in_its_format(tmp_path, name):
+    ps.save(cloud(9), tmp_path / name)
+    assert output_beside(tmp_path / name, "pruned").name == name.replace("room", "room_pruned")

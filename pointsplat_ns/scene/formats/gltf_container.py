@@ -12,7 +12,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import unquote
 
 import numpy as np
@@ -37,19 +37,22 @@ class Container:
 
     path: Path
     content: dict[str, Any]
-    binary: memoryview | None = None
-    """The binary chunk of a ``.glb``."""
+    binary: tuple[int, int] | None = None
+    """Start and size of the binary chunk of a ``.glb``."""
     _buffers: dict[int, memoryview] = field(default_factory=dict)
 
     @classmethod
     def open(cls, path: Path) -> Container:
         """Read the description of a ``.glb`` or ``.gltf``, told apart by content."""
-        data = load_bytes(path)
-        text: bytes | memoryview = data
+        with open_regular(path) as stream:
+            found = _chunks(stream, path) if stream.read(4) == MAGIC else None
         binary = None
-        if data[:4] == MAGIC:
-            text, binary = _chunks(data, path)
-        content = json.loads(bytes(text).decode("utf-8-sig"))
+        if found is None:
+            text = load_bytes(path)
+        else:
+            (start, size), binary = found
+            text = bytes(_bytes_at(path, start, size))
+        content = json.loads(text.decode("utf-8-sig"))
         if not isinstance(content, dict) or not isinstance(content.get("asset"), dict):
             raise SceneError(f"{path}: not a glTF file; its description names no asset")
         if not str(content["asset"].get("version", "")).startswith("2"):
@@ -176,7 +179,7 @@ class Container:
         if uri is None:
             if self.binary is None or index != 0:
                 raise ValueError(f"buffer {index} has no data")
-            return self.binary
+            return _bytes_at(self.path, *self.binary)
         if str(uri).startswith("data:"):
             head, comma, text = str(uri).partition(",")
             if not comma or not head.endswith(";base64"):
@@ -185,10 +188,7 @@ class Container:
                 return memoryview(base64.b64decode(text, validate=True))
             except binascii.Error as error:
                 raise ValueError(f"buffer {index}: {error}") from error
-        file = file_beside(self.path, unquoted(uri))
-        require_memory(file, size)
-        with failure_named(file, "read"), open_regular(file) as stream:
-            return memoryview(stream.read(size))
+        return _bytes_at(file_beside(self.path, unquoted(uri)), 0, size)
 
 
 def unquoted(uri: Any) -> Any:
@@ -283,29 +283,43 @@ def _description(content: dict[str, Any], least: int) -> bytes:
     return text.ljust(max(least, -(-len(text) // 4) * 4))
 
 
-def _chunks(data: bytes, path: Path) -> tuple[memoryview, memoryview | None]:
-    """The JSON of a ``.glb``, and its binary chunk if it has one."""
-    if len(data) < 12:
-        raise SceneError(f"{path}: truncated; a .glb has a header of 12 bytes, found {len(data)}")
-    _, version, size = struct.unpack_from("<4sII", data)
+def _chunks(stream: BinaryIO, path: Path) -> tuple[tuple[int, int], tuple[int, int] | None]:
+    """Start and size of the JSON of a ``.glb``, and of its binary chunk if it has one. The stream is
+    behind the magic number."""
+    stored = path.stat().st_size
+    head = stream.read(8)
+    if len(head) < 8:
+        raise SceneError(f"{path}: truncated; a .glb has a header of 12 bytes, found {stored}")
+    version, size = struct.unpack("<II", head)
     if version != 2:
         raise SceneError(f"{path}: glTF of version {version}; expected 2")
-    if size > len(data):
-        raise SceneError(f"{path}: truncated; {size} bytes expected, found {len(data)}")
-    found: list[memoryview] = []
+    if size > stored:
+        raise SceneError(f"{path}: truncated; {size} bytes expected, found {stored}")
+    found: list[tuple[int, int]] = []
     at = 12
     for wanted in (b"JSON", b"BIN\0"):
-        if at + _CHUNK.size > size:
+        stream.seek(at)
+        chunk = stream.read(_CHUNK.size)
+        if len(chunk) < _CHUNK.size:
             break
-        length, kind = _CHUNK.unpack_from(data, at)
+        length, kind = _CHUNK.unpack(chunk)
         at += _CHUNK.size
         if kind != wanted or at + length > size:
             break
-        found.append(memoryview(data)[at : at + length])
+        found.append((at, length))
         at += length
     if not found:
         raise SceneError(f"{path}: damaged glTF file (no chunk of JSON at byte 12)")
     return found[0], found[1] if len(found) > 1 else None
+
+
+def _bytes_at(path: Path, start: int, size: int) -> memoryview:
+    """Bytes of a file, fewer if it ends before."""
+    with failure_named(path, "read"), open_regular(path) as stream:
+        size = max(min(size, path.stat().st_size - start), 0)
+        require_memory(path, size)
+        stream.seek(start)
+        return memoryview(stream.read(size))
 
 
 def _is_whole(number: Any) -> bool:
