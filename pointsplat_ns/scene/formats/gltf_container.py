@@ -284,8 +284,8 @@ def _description(content: dict[str, Any], least: int) -> bytes:
 
 
 def _chunks(stream: BinaryIO, path: Path) -> tuple[tuple[int, int], tuple[int, int] | None]:
-    """Start and size of the JSON of a ``.glb``, and of its binary chunk if it has one. The stream is
-    behind the magic number."""
+    """Start and size of the JSON of a ``.glb``, and of its binary chunk if it has one. The stream
+    is behind the magic number."""
     stored = path.stat().st_size
     head = stream.read(8)
     if len(head) < 8:
