@@ -88,7 +88,7 @@ _PLY = (b"ply\n", b"ply\r")
 _CONVERT = (
     "convert it to .ply or .sog with splat-transform, or open it in SuperSplat and export the scene"
 )
-_EXPORT = "export the scene as .ply, .sog or .spz from the program that made it"
+_EXPORT = "export the scene as .ply, .sog, .spz or .glb from the program that made it"
 
 FORMATS = (
     # Longer suffixes come before the suffixes that they end with, and names that occur in several
