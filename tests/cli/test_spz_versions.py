@@ -83,7 +83,7 @@ def test_a_folder_s_results_have_the_version_and_are_made_again_for_another(tmp_
     ps.save(ball(120, 1, opacity=1.0, bright=1.0), tmp_path / "rooms" / "a.spz", spz_version=3)
     words = ("compact", tmp_path / "rooms", "--keep", "50%", "--effort", "instant")
     run(*words)
-    assert capsys.readouterr().out.endswith(f"\n{spz_readers(4)}\n")
+    assert f"\n{spz_readers(4)}\n" in capsys.readouterr().out
     assert version_of(tmp_path / "rooms_compact" / "a.spz") == 4
     said = refusal(capsys, tmp_path, *words, "--spz-version", "2")
     assert "results of other options" in said
