@@ -183,14 +183,14 @@ def print_folder(
         header = ("scene", *(titles.get(name, name) for name in columns), "status")
         note = "dB: PSNR against the scene's own renders" if compared else ""
         print_table(header, rows, note, left=(0, len(header) - 1))
-        say(
-            f"{folder}: {len(results) - failed} of {len(results)} scenes, and the table "
-            f"{FOLDER_FILES.scenes_table}"
-        )
         done = [result.output for result in results if result.status in ("done", "done before")]
         spz = next((file for file in map(Path, done) if file.suffix == ".spz"), None)
         if spz is not None:
             print_readers(spz)
+        say(
+            f"{folder}: {len(results) - failed} of {len(results)} scenes, and the table "
+            f"{FOLDER_FILES.scenes_table}"
+        )
         for path in shown:
             say(f"{path}: all scenes before and after")
     if failed:
