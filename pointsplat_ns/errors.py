@@ -83,7 +83,7 @@ class BudgetError(PointSplatError, ValueError):
 
 
 class MissingPackageError(PointSplatError):
-    """An optional package that a function needs: nerfstudio.
+    """An optional package that a function needs: nerfstudio or distributed.
 
     Example:
         >>> raise MissingPackageError("training needs nerfstudio, which is not installed")
@@ -93,7 +93,11 @@ class MissingPackageError(PointSplatError):
     """
 
 
-def need(package: Literal["nerfstudio"], what: str) -> None:
+_EXTRAS = {"nerfstudio": "nerfstudio", "distributed": "cluster"}
+"""Extra of this package that installs an optional one."""
+
+
+def need(package: Literal["nerfstudio", "distributed"], what: str) -> None:
     """Raise a MissingPackageError, with ``what`` needs the package, unless it can be imported."""
     try:
         importlib.import_module(package)
@@ -101,7 +105,7 @@ def need(package: Literal["nerfstudio"], what: str) -> None:
         if error.name != package:  # installed, but one of its dependencies is missing
             raise
         # pip also installs missing dependencies.
-        remedy = f"install it with pip install 'pointsplat-ns[{package}]'"
+        remedy = f"install it with pip install 'pointsplat-ns[{_EXTRAS[package]}]'"
         raise MissingPackageError(
             f"{what} needs {package}, which is not installed; {remedy}"
         ) from None

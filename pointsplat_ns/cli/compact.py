@@ -73,6 +73,7 @@ def compact(
     html: Path | None = None,
     force: options.Force = False,
     jobs: options.Jobs = None,
+    cluster: options.Cluster = None,
     verbose: options.Verbose = False,
     json_output: options.Json = False,
 ) -> None:
@@ -115,9 +116,12 @@ def compact(
     if how.spz_version is None:
         how = replace(how, spz_version=purpose.spz_version)
     if is_folder_of_scenes(scene):
-        return _compact_folder(scene, how, output, purpose, picture, html, force, jobs, json_output)
-    if jobs is not None:
-        raise ps.SceneError(f"{scene}: a single scene; --jobs is for a folder of scenes")
+        return _compact_folder(
+            scene, how, output, purpose, picture, html, force, jobs, cluster, json_output
+        )
+    for option, given in (("--jobs", jobs), ("--cluster", cluster)):
+        if given is not None:
+            raise ps.SceneError(f"{scene}: a single scene; {option} is for a folder of scenes")
     from pointsplat_ns.pipeline import run
     from pointsplat_ns.pipeline.quality import quality_of_file
     from pointsplat_ns.scene.formats import format_to_write
@@ -178,6 +182,7 @@ def _compact_folder(
     html: Path | None,
     force: bool,
     jobs: int | None,
+    cluster: str | None,
     json_output: bool,
 ) -> None:
     """Compact all scenes of a folder, and print a table of the results."""
@@ -207,6 +212,7 @@ def _compact_folder(
         html=html,
         picture=picture,
         jobs=1 if jobs is None else jobs,
+        cluster=cluster,
         force=force,
         progress=True,
     )

@@ -19,6 +19,14 @@ Jobs = Annotated[
         "1."
     ),
 ]
+Cluster = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="ADDRESS",
+        help="for a scene larger than memory: dask cluster whose workers share its parts, such as "
+        "tcp://host:8786, or a scheduler file; by default none.",
+    ),
+]
 
 
 def prune(
@@ -27,6 +35,7 @@ def prune(
     output: options.Output = None,
     force: options.Force = False,
     jobs: Jobs = None,
+    cluster: Cluster = None,
     memory: options.Megabytes | None = None,
     verbose: options.Verbose = False,
     json_output: options.Json = False,
@@ -42,7 +51,7 @@ def prune(
             of a run.
         memory: memory limit, such as 8GB; by default the free memory. A PLY that needs more is
             merged in parts, with temporary files beside the output, from which a killed command
-            resumes. With --jobs the limit applies to each process.
+            resumes. With --jobs or --cluster the limit applies to each process.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -59,7 +68,9 @@ def prune(
     options.check_outputs(output, force)
     how = replace(how, target_format=format_to_write(output).suffix)
     limit = None if memory is None else 1e6 * memory
-    done = run.prune(scene, how, output=output, memory=limit, jobs=jobs, progress=True)
+    done = run.prune(
+        scene, how, output=output, memory=limit, jobs=jobs, cluster=cluster, progress=True
+    )
     log_report(done.report)
     in_parts = done.report.written is not None
     small: ps.Gaussians | PlyRows | None = PlyRows.open(output) if in_parts else done.report.scene

@@ -71,6 +71,14 @@ Jobs = Annotated[
         help="for a folder: number of processes that share the work and the cores; by default 1."
     ),
 ]
+Cluster = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="ADDRESS",
+        help="for a folder: dask cluster whose workers share the work, such as tcp://host:8786, or "
+        "a scheduler file; by default none.",
+    ),
+]
 Verbose = Annotated[
     bool, tyro.conf.arg(help="print details of the result and of choices for the scene.")
 ]

@@ -24,6 +24,7 @@ from pointsplat_ns.scene.formats import format_to_read
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import PlyRows, read_ply
 from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.cluster import Cluster
 from pointsplat_ns.system.files import bytes_text
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.workers import check_jobs
@@ -103,6 +104,7 @@ def prune_file(
     memory: float | None = None,
     progress: Progress = silent,
     jobs: int = 1,
+    cluster: Cluster | None = None,
 ) -> tuple[int, float]:
     """Merge a PLY cell by cell. A killed call resumes from a hidden folder beside the output.
 
@@ -112,6 +114,7 @@ def prune_file(
         options: options of pruning, and of views: a file of cameras, or sampled views.
         memory: limit in bytes. Memory beyond the largest cell changes nothing.
         jobs: number of processes that share the cells, each within ``memory``.
+        cluster: its workers share the cells instead, if given; they see the folder of ``output``.
 
     Returns:
         The number of drawable Gaussians before, and the duration in seconds.
@@ -121,7 +124,8 @@ def prune_file(
         SceneError: if a file cannot be read or written, or the disk has no room for temporary
             files.
         BudgetError: if the budget does not fit the scene.
-        DataError: if the cameras are not usable, or the number of jobs is invalid.
+        DataError: if the cameras are not usable, the number of jobs is invalid, or a worker does
+            not see the folder.
     """
     start = time.perf_counter()
     check_jobs(jobs)
@@ -178,11 +182,21 @@ def prune_file(
     count = count_of(rows.count)  # raises errors before the long work
     # Between rounds, every Gaussian takes 150 bytes.
     size = rows.count * (_row_bytes(rows) + 150) + count * _row_bytes(rows)
-    scratch = Scratch(output.with_name(f".{output.name}.cells"), work, size)
+    place = output if cluster is None else output.absolute()
+    scratch = Scratch(place.with_name(f".{output.name}.cells"), work, size)
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
     with scratch.left_if_useful():
         before, _ = merge_file(
-            rows, count_of, output, most, scratch, views, sampler, progress, jobs=jobs
+            rows,
+            count_of,
+            output,
+            most,
+            scratch,
+            views,
+            sampler,
+            progress,
+            jobs=jobs,
+            cluster=cluster,
         )
     scratch.remove()
     return before, time.perf_counter() - start

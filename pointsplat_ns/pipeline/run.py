@@ -29,8 +29,10 @@ from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import read_ply
 from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.cluster import connected
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
+from pointsplat_ns.system.workers import check_jobs
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +60,7 @@ def prune(
     output: Path | None = None,
     memory: float | None = None,
     jobs: int | None = None,
+    cluster: str | None = None,
     progress: bool | Progress = False,
 ) -> Outcome:
     """Read a scene and prune it. A PLY that does not fit into memory is merged in cells.
@@ -70,6 +73,8 @@ def prune(
             killed call resume. By default a temporary file, which is then read.
         memory: limit in bytes; by default the free memory.
         jobs: number of processes that share the cells, each within ``memory``.
+        cluster: address of a dask cluster whose workers share the cells instead, each within
+            ``memory``; they see the folder of ``output``.
         progress: True shows a bar; a function is called with the current task and its share done.
 
     Raises:
@@ -79,18 +84,24 @@ def prune(
     rows = None
     if not isinstance(scene, Gaussians) and views is None:
         rows = rows_to_prune(Path(scene), options, memory)
-    if rows is None and jobs is not None:
-        raise SceneError(
-            f"{scene}: fits into memory; expected no --jobs, which is for merging in parts"
-        )
+    for option, given in (("--jobs", jobs), ("--cluster", cluster)):
+        if rows is None and given is not None:
+            raise SceneError(
+                f"{scene}: fits into memory; expected no {option}, which is for merging in parts"
+            )
     if rows is None:
         return _prune_in_memory(scene, options, views, progress)
     if options.photos is not False:
         raise SceneError(f"{scene}: does not fit into memory; expected no --photos")
     processes = 1 if jobs is None else jobs
-    with progress_bar(progress) as report, tempfile.TemporaryDirectory() as folder:
+    check_jobs(processes, cluster)
+    with (
+        connected(cluster) as machines,
+        progress_bar(progress) as report,
+        tempfile.TemporaryDirectory() as folder,
+    ):
         target = Path(folder) / "merged.ply" if output is None else output
-        before, seconds = prune_file(rows, target, options, memory, report, processes)
+        before, seconds = prune_file(rows, target, options, memory, report, processes, machines)
         stages: tuple[StageResult, ...] = ()
         if output is None:
             stages = (StageResult("merge", read_ply(target), after=None),)

@@ -29,6 +29,9 @@ from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import METHOD_NAMES, Run, open_run
 from pointsplat_ns.system.files import one_line
 
+SHIPPED = "shipped"
+"""Name of the shipped refiner, in place of a path."""
+
 
 @dataclass(frozen=True, eq=False)
 class TrainedRefiner:
@@ -98,7 +101,7 @@ def load_refiner(
         500
     """
     device = default_device() if device is None else device
-    shipped = path is None or str(path) == "shipped"
+    shipped = path is None or str(path) == SHIPPED
     path = shipped_refiner(by or "merge") if path is None or shipped else Path(path)
     if shipped and not path.is_file():
         raise WeightsError(

@@ -1,4 +1,5 @@
-"""Distributes work over several processes of this machine, with :mod:`concurrent.futures`."""
+"""Distributes work over several processes of this machine, with :mod:`concurrent.futures`, or over
+a cluster."""
 
 from __future__ import annotations
 
@@ -14,11 +15,14 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection, get_context
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.system.cores import cores
 from pointsplat_ns.system.threads import THREADS_VARIABLE, fixed_threads, most_threads
+
+if TYPE_CHECKING:
+    from pointsplat_ns.system.cluster import Cluster
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,13 +33,23 @@ class Workers(Generic[Item, Result]):
     process does the work. When the context or this process ends, the others end at once.
 
     Args:
-        function: pickled once per process.
-        jobs: number of processes.
+        function: pickled once per process, or once per item for a cluster.
+        jobs: number of processes; 1 for a cluster.
+        cluster: does the work, if given.
+        shared: absolute path of a file that a cluster must see.
     """
 
-    def __init__(self, function: Callable[[Item], Result], jobs: int):
+    def __init__(
+        self,
+        function: Callable[[Item], Result],
+        jobs: int,
+        cluster: Cluster | None = None,
+        shared: Path = Path(os.sep),
+    ):
         self._function = function
         self._jobs = jobs
+        self._cluster = cluster
+        self._shared = shared
 
     def __enter__(self) -> Workers[Item, Result]:
         if self._jobs > 1:
@@ -55,7 +69,11 @@ class Workers(Generic[Item, Result]):
 
     def results(self, items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
         """Each item with its result, in order of completion. Raises the exceptions of the function,
-        and PointSplatError if a process is killed."""
+        and PointSplatError if a process is killed; on a cluster as
+        :meth:`~pointsplat_ns.system.cluster.Cluster.results`."""
+        if self._cluster is not None:
+            yield from self._cluster.results(self._function, items, self._shared)
+            return
         if self._jobs == 1:
             for item in items:
                 yield item, self._function(item)
@@ -72,10 +90,15 @@ class Workers(Generic[Item, Result]):
             ) from error
 
 
-def check_jobs(jobs: int) -> None:
-    """Raise a DataError if the number of processes is not positive."""
+def check_jobs(jobs: int, cluster: str | None = None) -> None:
+    """Raise a DataError if the number of processes is not positive, or above 1 for a cluster."""
     if jobs < 1:
         raise DataError(f"jobs is {jobs}; expected 1 or more")
+    if jobs > 1 and cluster is not None:
+        raise DataError(
+            f"jobs is {jobs}; expected none with a cluster, which has as many processes as its "
+            "workers"
+        )
 
 
 _function: Callable[[], Callable[[Any], Any]]

@@ -15,7 +15,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ from pointsplat_ns.pipeline.compact_scene import compact_scene, compact_to_quali
 from pointsplat_ns.pipeline.options import CompactOptions
 from pointsplat_ns.pipeline.quality import judge_of, read_back
 from pointsplat_ns.pipeline.repair_budget import Effort
-from pointsplat_ns.pipeline.trained_refiner import load_refiner
+from pointsplat_ns.pipeline.trained_refiner import SHIPPED, TrainedRefiner, load_refiner
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.rendering.comparison.sizes import size_text
@@ -36,6 +36,7 @@ from pointsplat_ns.scene.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.scene.formats import SPZ_VERSION, Format, format_like
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.reading import read_scene, save_as, source_file, source_parts
+from pointsplat_ns.system.cluster import LostWorkError, connected
 from pointsplat_ns.system.files import (
     content_hash,
     json_text,
@@ -130,6 +131,7 @@ def compact_folder(
     html: str | Path | None = None,
     picture: str | Path | None = None,
     jobs: int = 1,
+    cluster: str | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
@@ -157,6 +159,9 @@ def compact_folder(
         jobs: number of processes, which share the cores. With more than one, the main code of the
             calling program must be under ``if __name__ == "__main__":``, as in any Python program
             that starts processes.
+        cluster: address of a dask cluster, such as "tcp://host:8786", or its scheduler file. Its
+            workers share the scenes, in place of processes here; all machines have the folders
+            under the same paths.
         force: overwrite foreign files, changed files, and results of other options.
         progress: True shows a bar; a function is called with the name of the current task and its
             share done.
@@ -167,6 +172,7 @@ def compact_folder(
 
     Raises:
         PointSplatError: if an option is invalid.
+        DataError: if no cluster answers, or a worker does not see the folder of results.
         SceneError: if there is no scene, or the output folder, page or picture holds other results.
 
     Example:
@@ -180,7 +186,7 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder) if output is None else Path(output)
-    trained = None if refiner is None else _loaded(refiner, by=by)
+    trained = None if refiner is None else load_refiner(refiner, by=by)
     options = CompactOptions(
         keep=keep,
         by=by or "",
@@ -217,7 +223,7 @@ def compact_folder(
         refiner=refiner,
     )
     page, sheet = (None if path is None else Path(path) for path in (html, picture))
-    return work_through(folder, target, work, target_format, jobs, progress, page, sheet)
+    return work_through(folder, target, work, target_format, jobs, progress, page, sheet, cluster)
 
 
 def work_through(
@@ -229,12 +235,13 @@ def work_through(
     progress: bool | Progress = False,
     page: Path | None = None,
     sheet: Path | None = None,
+    cluster: str | None = None,
 ) -> list[SceneResult]:
     """Do the work on every scene of a folder, unless it is finished, and write the table of results
     to the folder ``target``. Inside of :func:`~pointsplat_ns.system.outputs.outputs_claimed`.
 
     Args:
-        folder, target, jobs, progress: as for :func:`compact_folder`.
+        folder, target, jobs, progress, cluster: as for :func:`compact_folder`.
         work: pickled for other processes.
         target_format: suffix of all results; by default the format of each scene.
         page, sheet: as ``html`` and ``picture`` of :func:`compact_folder`.
@@ -242,7 +249,7 @@ def work_through(
     Raises:
         SceneError: as :func:`compact_folder`.
     """
-    check_jobs(jobs)
+    check_jobs(jobs, cluster)
     for shown, end in ((page, ".html"), (sheet, ".png")):
         if shown is not None:
             need_suffix(shown, end)
@@ -255,29 +262,33 @@ def work_through(
         Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
         for name, path in find_scenes(folder).items()
     ]
-    if not work.force:
-        claim(target)
-    _describe(target, work.record, work.force)
     results: dict[str, SceneResult] = {}
-    try:
-        with progress_bar(progress) as report, Workers(work, jobs) as workers:
-            report(work.label, 0.0)
-            for task, result in workers.results(tasks):
-                results[task.name] = result
-                report(work.label, len(results) / len(tasks))
-                if result.status == "failed":
-                    logger.warning("%s failed: %s", result.name, result.error)
-    finally:  # also after an interruption
-        for task in tasks:
-            if task.name not in results:  # its process may have died while writing
-                for part in task.output.parent.glob(f".{glob.escape(task.output.name)}*.part"):
-                    part.unlink(missing_ok=True)
-        rows = [results.get(task.name) or _known(task, _read_record(task)) for task in tasks]
-        write_csv([dataclasses.asdict(row) for row in rows], target / FOLDER_FILES.scenes_table)
-        if page is not None:
-            write_gallery(page, folder.resolve().name, rows)
-        if sheet is not None:
-            write_sheet(sheet, rows)
+    with connected(cluster) as machines:
+        if machines is not None:
+            work = work.started_in(Path.cwd())
+        if not work.force:
+            claim(target)
+        _describe(target, work.record, work.force)
+        shared = target.absolute() / FOLDER_FILES.scenes
+        try:
+            with progress_bar(progress) as report, Workers(work, jobs, machines, shared) as workers:
+                report(work.label, 0.0)
+                for task, result in _results(workers, tasks):
+                    results[task.name] = result
+                    report(work.label, len(results) / len(tasks))
+                    if result.status == "failed":
+                        logger.warning("%s failed: %s", result.name, result.error)
+        finally:  # also after an interruption
+            for task in tasks:
+                # Workers of a cluster may still be writing theirs.
+                if task.name not in results and machines is None:
+                    task.remove_parts()
+            rows = [results.get(task.name) or _known(task, _read_record(task)) for task in tasks]
+            write_csv([dataclasses.asdict(row) for row in rows], target / FOLDER_FILES.scenes_table)
+            if page is not None:
+                write_gallery(page, folder.resolve().name, rows)
+            if sheet is not None:
+                write_sheet(sheet, rows)
     return rows
 
 
@@ -287,7 +298,11 @@ def output_folder(folder: Path, done: str = "compact") -> Path:
     return unnamed(place.with_name(f"{place.name}_{done}"))
 
 
-_loaded = functools.cache(load_refiner)  # once in each process
+@functools.cache
+def _loaded(path: str | Path, by: str | None, sha256: str = "") -> TrainedRefiner:
+    """A refiner, loaded once in each process. Workers of a cluster outlive files: ``sha256`` tells
+    another content of the same path."""
+    return load_refiner(path, by=by)
 
 
 @dataclass(frozen=True)
@@ -297,13 +312,28 @@ class Task:
     name: str
     source: Path
     output: Path
+    paths: tuple[str, str] | None = None
+    """Both as the user's command names them, if these are others."""
 
     def result(
         self, status: Literal["done", "done before", "failed", "open"], **facts: Any
     ) -> SceneResult:
-        return SceneResult(
-            name=self.name, source=str(self.source), output=str(self.output), status=status, **facts
+        source, output = self.paths or (str(self.source), str(self.output))
+        return SceneResult(name=self.name, source=source, output=output, status=status, **facts)
+
+    def started_in(self, folder: Path) -> Task:
+        """The task where the current folder is another one than that of the command."""
+        return dataclasses.replace(
+            self,
+            source=folder / self.source,
+            output=folder / self.output,
+            paths=(str(self.source), str(self.output)),
         )
+
+    def remove_parts(self) -> None:
+        """Remove what a process left that died while writing the result."""
+        for part in self.output.parent.glob(f".{glob.escape(self.output.name)}*.part"):
+            part.unlink(missing_ok=True)
 
     @property
     def folder(self) -> Path:
@@ -314,6 +344,17 @@ class Task:
     def record(self) -> Path:
         """File with the figures and hashes of the result."""
         return self.output.with_name(f"{self.output.name}.json")
+
+
+def _results(
+    workers: Workers[Task, SceneResult], tasks: list[Task]
+) -> Iterator[tuple[Task, SceneResult]]:
+    """Results of the workers. A scene of which workers of a cluster die has failed."""
+    try:
+        yield from workers.results(tasks)
+    except LostWorkError as error:
+        for task, reason in error.reasons.items():
+            yield task, task.result("failed", error=reason)
 
 
 def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
@@ -359,6 +400,12 @@ class FolderWork:
     force: bool
     label: ClassVar[str]
     """Name of the work, beside its progress."""
+    start: Path | None = dataclasses.field(default=None, kw_only=True)
+    """Current folder of the command, if that of a process is another."""
+
+    def started_in(self, folder: Path) -> FolderWork:
+        """The same work, for processes whose current folder is another."""
+        return dataclasses.replace(self, start=folder)
 
     def make(self, task: Task) -> Made:
         """The result of a scene."""
@@ -369,6 +416,7 @@ class FolderWork:
 
     def __call__(self, task: Task) -> SceneResult:
         """The result of a scene. On an error its status is ``failed``, and no file is left."""
+        task = task if self.start is None else task.started_in(self.start)
         start = time.perf_counter()
         try:
             for part in source_parts(task.source):
@@ -405,6 +453,7 @@ class FolderWork:
     def _written(self, task: Task, source_bytes: int, key: str, start: float) -> SceneResult:
         """Write a result and its record. A process killed in between leaves only the record, so the
         scene counts as open."""
+        task.remove_parts()
         new = not self.force and not os.path.lexists(task.output)
         made = self.make(task)
         with replacing(task.output, named=False, new=new) as part:
@@ -439,12 +488,23 @@ class _Compacting(FolderWork):
     refiner: str | Path | None  # loaded by each process
     label: ClassVar[str] = "compact"
 
+    def started_in(self, folder: Path) -> _Compacting:
+        data, refiner = self.options.data, self.refiner
+        return dataclasses.replace(
+            self,
+            options=dataclasses.replace(self.options, data=None if data is None else folder / data),
+            refiner=refiner if refiner is None or str(refiner) == SHIPPED else folder / refiner,
+            start=folder,
+        )
+
     def make(self, task: Task) -> Made:
         dense = read_scene(task.source)
         kind = self.options.format_of(task.output.name)
         options = dataclasses.replace(self.options, target_format=kind.suffix)
         views = ViewProvider(dense, run=task.source, data=options.data, resolution=options.size)
-        trained = None if self.refiner is None else _loaded(self.refiner, by=options.by)
+        trained = None
+        if self.refiner is not None:
+            trained = _loaded(self.refiner, options.by, self.record["refiner"])
         compact = compact_to_quality if options.searched else compact_scene
         made = compact(dense, options, views, refiner=trained)
         if made.interrupted:

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("quick")
 OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-print-completion"}
 """Options that the documentation names and that belong to programs of others."""
 
-OTHERS = ("docker", "git", "npm", "pip", "pre-commit", "tensorboard", "uv")
+OTHERS = ("dask", "docker", "export", "git", "npm", "pip", "pre-commit", "tensorboard", "uv")
 """Programs of others, whose arguments nothing here reads."""
 
 CUT = 1500

@@ -9,7 +9,7 @@
 4. In each cell, members are regrouped, and their rows are written.
 
 Finished steps stay on disk, and a killed command resumes from them. Several processes may share the
-cells.
+cells, or the workers of a cluster, which see the same disk.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.errors import BudgetError, PointSplatError
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.pruning.merging.cells import Cells, Scratch, divided
 from pointsplat_ns.pruning.merging.groups import Groups, scene_maker
@@ -38,6 +38,7 @@ from pointsplat_ns.pruning.merging.visibility import drawn_step, views_to_weigh,
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import PlyRows, header_bytes, ply_bytes, row_table
 from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.cluster import Cluster, LostWorkError
 from pointsplat_ns.system.files import replacing
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
@@ -61,6 +62,7 @@ def merge_file(
     progress: Progress = silent,
     settings: MergeSettings = MERGING,
     jobs: int = 1,
+    cluster: Cluster | None = None,
 ) -> tuple[int, int]:
     """Merge the Gaussians of a file, cell by cell, and write the result.
 
@@ -77,6 +79,8 @@ def merge_file(
         settings: the tuned numbers.
         jobs: number of processes that share the cells. The result is exact to the bit for any
             number.
+        cluster: works on the cells in place of processes, if given; ``scratch`` is then an absolute
+            path that its workers see.
 
     Returns:
         The numbers of Gaussians before and after.
@@ -84,7 +88,7 @@ def merge_file(
     Raises:
         SceneError: if a file cannot be read or written, or no Gaussian can be drawn.
         BudgetError: from ``count_of``, or if there are more cells than Gaussians after merging.
-        PointSplatError: if processes are killed.
+        PointSplatError: if processes are killed, or workers die of one cell time and again.
     """
     cells = divided(rows, most, scratch, functools.partial(progress, "dividing into cells"))
     k = count_of(cells.count)
@@ -105,16 +109,23 @@ def merge_file(
             )
             return vars(overview_of(cells, k, *seen, settings, report))
 
-    work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
-    with Workers(work, jobs) as workers:
+    scratch.make("overview", look)
+    work = _Work(cells, k, sampler, settings)
+    with Workers(work, jobs, cluster, scratch.description) as workers:
 
         def each(what: str, *step: float) -> None:
             """Run a step on every cell."""
             progress(what, 0.0)
-            for done, _ in enumerate(
-                workers.results([(cell, *step) for cell in range(len(cells))]), 1
-            ):
-                progress(what, done / len(cells))
+            tasks = [(cell, *step) for cell in range(len(cells))]
+            try:
+                for done, _ in enumerate(workers.results(tasks), 1):
+                    progress(what, done / len(cells))
+            except LostWorkError as error:
+                (cell, *_), reason = next(iter(error.reasons.items()))
+                raise PointSplatError(
+                    f"{output}: {what}, part {cell + 1} of {len(cells)}: {reason}; run the same "
+                    "command to resume"
+                ) from error
 
         rounds = 0
         left = -1
@@ -193,10 +204,14 @@ class _Work:
     the size change."""
 
     cells: Cells
-    overview: Overview
     k: int
     sampler: Callable[..., Sampler]
     settings: MergeSettings
+
+    @functools.cached_property
+    def overview(self) -> Overview:
+        """Read by each process, because it is too large to be sent with each step."""
+        return Overview(**self.cells.scratch.known("overview"))
 
     def __call__(self, step: tuple[Any, ...]) -> None:
         cell, rounds, *size_change = step

@@ -54,7 +54,7 @@ class Scratch:
 
     def __init__(self, folder: Path, work: Mapping[str, object], size: int = 0):
         self.folder = folder
-        known = folder / "work.json"
+        known = self.description
         try:
             same = not folder.is_symlink() and all(map(is_own_file, folder.iterdir()))
             same = same and json.loads(read_text(known)) == work
@@ -74,6 +74,11 @@ class Scratch:
             with self.left_if_useful():
                 require_space(folder, folder, size)
                 write_json(work, known)
+
+    @property
+    def description(self) -> Path:
+        """File with the description of the work."""
+        return self.folder / "work.json"
 
     @contextmanager
     def left_if_useful(self) -> Iterator[None]:
