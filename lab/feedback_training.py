@@ -79,6 +79,16 @@ class Kept:
     features: list[Tensor]  # per step [m, F] float32
     moves: list[dict[str, Tensor]]  # per step [m, ...] Adam's steps by parameter
 
+    @torch.no_grad()
+    def slopes(self, gradients: dict[str, Tensor]) -> Tensor:
+        """Derivatives (M, 6) of the last scene's loss by the factors of all steps, to first order,
+        from its gradients by parameter."""
+        found = []
+        for rows, moves in zip(self.rows, self.moves, strict=True):
+            along = [(gradients[name][rows] * moves[name]).flatten(1).sum(1) for name in PARAMETERS]
+            found.append(torch.stack(along, dim=1))
+        return torch.cat(found)
+
     def loss(self, network: torch.nn.Module, gradients: dict[str, Tensor], share: float) -> Tensor:
         """A number whose gradient in the network's parameters is that of the last scene's loss.
 
@@ -87,25 +97,12 @@ class Kept:
             gradients: of the loss in the last scene, by parameter.
             share: share of the Gaussians that were kept.
         """
-        with torch.no_grad():
-            slopes = torch.cat(
-                [
-                    torch.stack(
-                        [
-                            (gradients[name][rows] * moves[name]).flatten(1).sum(1)
-                            for name in PARAMETERS
-                        ],
-                        dim=1,
-                    )
-                    for rows, moves in zip(self.rows, self.moves, strict=True)
-                ]
-            )  # [M, 6] of the loss by the factors
-        return (network(torch.cat(self.features)) * slopes).sum() / share
+        return (network(torch.cat(self.features)) * self.slopes(gradients)).sum() / share
 
 
 @torch.no_grad()
 def roll_out(
-    network: torch.nn.Module,
+    network: Callable[[Tensor], Tensor],
     piece: Piece,
     steps: int,
     seed: int | str,
@@ -140,7 +137,7 @@ def roll_out(
                 gradients.append(gradients_of(now, view, target, backend=TRAINING.backend))
         feedback.observe(gradients.pop(0))
         done = step / steps
-        features = further(feedback.features(now, done, steps), now)
+        features = further(feedback.features(now, done, steps))
         factors = network(features)
         moves = feedback.moves(rate_factor * cosine_factor(done, REPAIR.last_factor))
         if kept is not None:
@@ -194,7 +191,11 @@ def measured_loss(
 
 
 def reached(
-    network: torch.nn.Module, piece: Piece, steps: int, seed: int | str, inputs: Inputs = no_inputs
+    network: Callable[[Tensor], Tensor],
+    piece: Piece,
+    steps: int,
+    seed: int | str,
+    inputs: Inputs = no_inputs,
 ) -> float:
     """Mean PSNR in all held-out views of a piece after a repair, dB."""
     views = [(index, size) for index in range(PIECES.held_out) for size in range(3)]
@@ -203,12 +204,12 @@ def reached(
 
 
 def repair_loss(
-    network: torch.nn.Module, piece: Piece, steps: int, seed: int | str, inputs: Inputs = no_inputs
+    network: FeedbackRefiner, piece: Piece, steps: int, seed: int | str
 ) -> tuple[float, Tensor]:
     """PSNR that a repair reaches, dB, and a number whose gradient in the network's parameters is
     that of its negative to first order."""
     kept = Kept([], [], [])
-    last = roll_out(network, piece, steps, seed, inputs, kept)
+    last = roll_out(network, piece, steps, seed, kept=kept)
     generator = random.Random(f"{seed} measured")
     indices = generator.sample(range(PIECES.held_out), TRAINING.measured)
     psnr, gradients = measured_loss(
@@ -222,7 +223,7 @@ def repair_loss(
 class TrainingState:
     """A network, its optimiser and the number of updates done; what a training resumes from."""
 
-    network: torch.nn.Module
+    network: FeedbackRefiner
     adam: torch.optim.Adam
     update: int = 0
 
@@ -280,10 +281,8 @@ def train_feedback(
     output: Path | None = None,
     progress: Callable[[float], None] | None = None,
     start: FeedbackRefiner | None = None,
-    network: torch.nn.Module | None = None,
-    inputs: Inputs = no_inputs,
     log: Callable[[int, float], None] | None = None,
-) -> torch.nn.Module:
+) -> FeedbackRefiner:
     """Train a feedback network.
 
     Connected processes (:mod:`pointsplat_ns.system.processes`) share the repairs of each update.
@@ -300,8 +299,6 @@ def train_feedback(
         progress: called with the share done, in [0, 1].
         start: a trained network to continue from; not changed. By default training starts from a
             network that gives plain Adam.
-        network: trained in place of a :class:`FeedbackRefiner`, in place; needs no output.
-        inputs: further inputs of ``network``.
         log: called with the number of the update and the mean PSNR that its repairs gain, dB.
 
     Returns:
@@ -319,8 +316,7 @@ def train_feedback(
         raise DataError(
             f"{at_once} repairs in an update; expected at least as many as processes, {size}"
         )
-    if network is None:
-        network = _initial(start, seed, pieces[0].dense.device)
+    network = _initial(start, seed, pieces[0].dense.device)
     rate = TRAINING.rate if start is None else TRAINING.rate_of_trained
     adam = torch.optim.Adam(network.parameters(), lr=rate, betas=TRAINING.betas)
     state = TrainingState(network, adam)
@@ -344,7 +340,7 @@ def train_feedback(
             if number % size == rank:
                 with one_thread_each():
                     own = f"{seed} {state.update} {number}"
-                    psnr, loss = repair_loss(network, piece, steps, own, inputs)
+                    psnr, loss = repair_loss(network, piece, steps, own)
                     (loss * (size / at_once)).backward()
                 gains.append(psnr - piece.psnr)
         processes.average_gradients(network.parameters())

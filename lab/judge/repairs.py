@@ -204,6 +204,7 @@ def main(
     scenes: tyro.conf.Positional[tuple[Path, ...]],
     networks: tuple[str, ...] = (),
     steps: tuple[int, ...] = (48, 192, 600),
+    adam: bool = True,
     keep: float = 0.1,
     width: int = 960,
     views: int = 12,
@@ -215,6 +216,7 @@ def main(
         scenes: PLY files that have a camera path of their name.
         networks: NAME=FILE of other networks.
         steps: numbers of steps.
+        adam: measure plain Adam, too.
         keep: share of the Gaussians that merging keeps.
         width: of the pictures, pixels; the height is 9/16 of it.
         views: at most so many views of each scene, evenly spread.
@@ -225,7 +227,7 @@ def main(
         raise SystemExit(f"--steps {' '.join(map(str, steps))}; expected numbers of at least 1")
     ways: dict[str, FeedbackRefiner | None] = {
         SHIPPED: shipped_feedback_refiner(torch.device("cpu")),
-        ADAM: None,
+        **({ADAM: None} if adam else {}),
         **{name: read_feedback_refiner(path) for name, path in map(named, networks)},
     }
     settings = {"views": views, "width": width, "keep": keep}

@@ -36,7 +36,6 @@ class FeedbackRefiner(nn.Module):
     Args:
         most_steps: maximum number of steps of the repairs in its training; longer ones enter the
             network as so many.
-        inputs: number of inputs; more than :attr:`FEATURES` for experiments.
 
     Example:
         >>> FeedbackRefiner()(torch.zeros(5, FeedbackRefiner.FEATURES)).unique().tolist()
@@ -49,12 +48,12 @@ class FeedbackRefiner(nn.Module):
     MAX_LOG_FACTOR = 2.0
     """Bound of the factors' logarithms: factors are from 1/7 to 7."""
 
-    def __init__(self, most_steps: int = 32, inputs: int = FEATURES) -> None:
+    def __init__(self, most_steps: int = 32) -> None:
         super().__init__()
         self.most_steps = most_steps
         with torch.device("cpu"):
             self.mlp = nn.Sequential(
-                linear(inputs, 64),
+                linear(self.FEATURES, 64),
                 nn.SiLU(),
                 linear(64, 64),
                 nn.SiLU(),

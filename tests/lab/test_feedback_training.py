@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from lab import feedback_pieces, feedback_training, make_feedback
-from lab.feedback_inputs import INPUTS, widened
+from lab import feedback_pieces, feedback_study, feedback_training, make_feedback
+from lab.feedback_inputs import COLUMNS, NEIGHBOURS, all_inputs
 from lab.feedback_pieces import MEMBERS, Piece, PieceSettings, member_features, pieces_of
 from lab.feedback_training import (
     FeedbackTrainingSettings,
@@ -50,7 +50,7 @@ def test_training_brings_repairs_closer(pieces):
     def mean(network: FeedbackRefiner) -> float:
         return sum(reached(network, piece, 8, seed) for piece in pieces for seed in range(2)) / 4
 
-    network = train_feedback(pieces, 25, at_once=2)
+    network = train_feedback(pieces, 20, at_once=1)
     assert mean(network) > mean(FeedbackRefiner()) + 0.05
 
 
@@ -172,16 +172,16 @@ def test_members_are_counted_and_measured(hollow_ball):
     assert features[1, 3:].tolist() == pytest.approx([0, 0], abs=1e-3)
 
 
-@pytest.mark.parametrize("name", INPUTS)
-def test_a_network_with_more_inputs_begins_as_the_one_that_it_widens(pieces, name):
-    inputs, more = INPUTS[name]
-    start = FeedbackRefiner()
-    torch.nn.init.normal_(start.mlp[-1].weight, std=0.1)
+def test_neighbours_and_members_follow_the_own_features(pieces):
     piece = pieces[0]
     features = torch.randn(len(piece.merged), FeedbackRefiner.FEATURES)
-    all_inputs = inputs(piece)(features, piece.merged)
-    assert all_inputs.shape[1] == FeedbackRefiner.FEATURES + more
-    torch.testing.assert_close(widened(start, more)(all_inputs), start(features))
+    inputs = all_inputs(piece)(features)
+    columns = COLUMNS["own and neighbours"][FeedbackRefiner.FEATURES :]
+    apart = torch.cdist(piece.merged.means.double(), piece.merged.means.double())
+    nearest = apart.argsort(1)[:, 1 : NEIGHBOURS + 1]
+    torch.testing.assert_close(inputs[:, columns], features[nearest].mean(1))
+    columns = COLUMNS["own and members"]
+    torch.testing.assert_close(inputs[:, columns], torch.cat([features, piece.members], dim=1))
 
 
 def test_the_command_makes_a_network_and_goes_on_where_it_was(hollow_ball, tmp_path, capsys):
@@ -204,3 +204,20 @@ def _metadata(path: Path) -> dict[str, str]:
 
     with safe_open(path, "pt") as file:
         return file.metadata()
+
+
+def test_the_study_of_inputs_measures_each_in_pieces_that_it_did_not_learn_from(
+    hollow_ball, tmp_path, monkeypatch
+):
+    for name in ("seen", "unseen"):
+        write_ply(hollow_ball, tmp_path / f"{name}.ply")
+    monkeypatch.setattr(feedback_study, "PIECES", SMALL)
+    paths = [tmp_path / "seen.ply"], (tmp_path / "unseen.ply",)
+    options = dict(keep=(0.2,), pieces=1, unseen_pieces=1, steps=4, folder=tmp_path)
+    feedback_study.main(*paths, **options, json_path=tmp_path / "study.json")
+    content = json.loads((tmp_path / "study.json").read_text())
+    assert [row["inputs"] for row in content["rows"]] == [*COLUMNS]
+    for row in content["rows"]:
+        assert [*row["gains"]] == ["unseen, piece 0"]
+        # a piece like the one that it learned from: the direction points up
+        assert row["first_order"] > 0

@@ -1,12 +1,13 @@
 """Records of the lab against its programs."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
 
 from lab.common.printing import put_between
-from lab.judge import ablation, large, record, tables_record
+from lab.judge import ablation, large, record, repairs, tables_record
 from lab.judge.record import FOLDER as RECORD
 from lab.numerics import cases, report, stability
 from lab.speed import beside, rasterizer
@@ -16,11 +17,19 @@ from pointsplat_ns.scene.ply import write_ply
 
 JUDGED = RECORD / "judge.json", RECORD / "judge_photos.json"
 
+
+def repairs_page(path: Path) -> str:
+    content = json.loads(path.read_text("utf-8"))
+    settings = content["settings"]
+    return repairs.page(content["rows"], path.name, settings["views"], settings["width"])
+
+
 PAGES = {
     "results.md": lambda: tables_record.page(tables_record.read(RECORD / "results.json"), RECORD),
     "speed.md": lambda: beside.page(json.loads((RECORD / "speed.json").read_text("utf-8"))["rows"]),
     "ablation.md": lambda: ablation.page(*record.read([RECORD / "ablation.json"], "ablation.py")),
     "large.md": lambda: large.page(json.loads((RECORD / "large.json").read_text("utf-8"))["rows"]),
+    "repairs.md": lambda: repairs_page(RECORD / "repairs.json"),
     "judge.md": lambda: record.page(*record.read(JUDGED)),
 }
 
