@@ -20,12 +20,13 @@ from lab.common.printing import markdown, number, start
 from lab.common.results import write_json
 from lab.common.running import folder_of_run, run
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
-from pointsplat_ns.scene.runs import METHOD_NAMES
+from pointsplat_ns.refinement import read_metadata
+from pointsplat_ns.scene.runs import METHOD_NAMES, RUN_FILES
 from pointsplat_ns.tools.tradeoff.measuring import machine_text
 
 HEADS = ("scene", "Gaussians", "MB", "PSNR", "SSIM", "LPIPS")
 
-COMPARED = "merge compact"
+COMPARED = "merge,compact"
 """Ways of this package that ns-eval adds, of the same number of Gaussians."""
 
 TIMESTAMP = "run"
@@ -78,14 +79,16 @@ def section(content: dict[str, Any]) -> str:
         for variant, figures in content["row"].items()
     ]
     taken = "; ".join(f"{what} {spent:.0f} s" for what, spent in content["cpu_seconds"].items())
-    commands = "\n".join(content["commands"])
+    wrapped = (textwrap.wrap(line, 114, break_on_hyphens=False) for line in content["commands"])
+    commands = "\n".join(" \\\n    ".join(words) for words in wrapped)
     size = f"{content['width']} x {content['height']}"
     about = (
         f"Replica itself, {size}: {content['trained']} frames train, {content['held_out']} "
         "are held out. They lie close to each other, so these figures show that the whole way "
-        "works, and not quality. The network starts from the one that ships and is trained on the "
-        "photos of this scene (*own photos*). PSNR (dB), SSIM and LPIPS (AlexNet) are against the "
-        f"held-out photos, at {content['scale']:g} of their size."
+        "works, and not quality. The network starts from the one that ships and takes "
+        f"{content['refiner_steps']:,} steps on the photos of this scene (*own photos*). PSNR "
+        "(dB), SSIM and LPIPS (AlexNet) are against the held-out photos, at "
+        f"{content['scale']:g} of their size."
     )
     return f"""## {content["frames"]} frames of one room: Replica's {content["scene"]}
 
@@ -137,6 +140,8 @@ def main(
         spent[what] = _cpu_seconds() - begun
     found = json.loads((output / "eval.json").read_text("utf-8"))
     held_out = found["results"]["scenes"][scene.name]["views"]
+    refined = folder_of_run(output / "refiner", scene.name, METHOD_NAMES.refiner, TIMESTAMP)
+    weights = refined / RUN_FILES.refiner
     content = {
         "scene": scene.name,
         "frames": len(frames),
@@ -147,10 +152,11 @@ def main(
         "scale": scale,
         "machine": machine_text(torch.device("cpu")),
         "commands": [
-            f"POINTSPLAT_COMPARE='{COMPARED}' {text}" if "ns-eval" in text else text
+            f"POINTSPLAT_COMPARE={COMPARED} {text}" if "ns-eval" in text else text
             for _, text in commands
         ],
         "cpu_seconds": spent,
+        "refiner_steps": read_metadata(weights)["steps"],
         "row": row(found, scene.name),
     }
     write_json(json_path, content)

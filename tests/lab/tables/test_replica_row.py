@@ -43,6 +43,7 @@ def test_the_section_has_all_variants_and_says_that_it_is_of_one_room(evaluation
             "height": 680,
             "scale": 0.5,
             "machine": "a machine",
+            "refiner_steps": 20,
             "commands": ["ns-train splatfacto-cpu"],
             "cpu_seconds": {"export": 1.0},
             "row": found,
@@ -50,6 +51,7 @@ def test_the_section_has_all_variants_and_says_that_it_is_of_one_room(evaluation
     )
     assert text.startswith("## 20 frames of one room: Replica's room0")
     assert "| refined | 1,000 | 0.25 | 30.00 | 0.900 | - |" in text
+    assert "takes 20 steps on the photos" in " ".join(text.split())
     assert (
         "18 frames train, 2 are held out" in " ".join(text.split())
         and "CPU time on a machine: export 1 s." in text
