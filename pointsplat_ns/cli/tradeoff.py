@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
+
+import tyro
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
@@ -15,16 +17,23 @@ from pointsplat_ns.system.terminal import print_table, say
 if TYPE_CHECKING:
     from pointsplat_ns.tools.tradeoff.points import Tradeoff
 
+Repair = Literal["none", "quick", "thorough", "photos"]
+
+_NAMES = f"{{{','.join(get_args(Repair))}}}"
+
 
 def tradeoff(
     scene: options.Scene,
     view_options: options.Flat[ViewOptions],
     output: options.Output = None,
-    keep: tuple[str, ...] = ("70%", "50%", "30%", "20%", "10%", "5%"),
+    keep: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[STR [STR ...]]")] = None,
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
-    repairs: tuple[Literal["none", "quick", "thorough", "photos"], ...] = ("none", "quick"),
-    views: int = 12,
+    repairs: Annotated[
+        tuple[Repair, ...] | None, tyro.conf.arg(metavar=f"[{_NAMES} [{_NAMES} ...]]")
+    ] = None,
+    views: int | None = None,
+    quick: bool = False,
     photos: Path | None = None,
     force: options.Force = False,
     json_output: options.Json = False,
@@ -35,12 +44,15 @@ def tradeoff(
     Args:
         output: folder for the results; by default beside the scene: room_tradeoff for room.ply,
             tradeoff in the folder of a run.
-        keep: budgets: ratios (30%), counts (50000) or sizes (12MB).
+        keep: budgets: ratios (30%), counts (50000) or sizes (12MB); by default 70% 50% 30% 20% 10%
+            5%, with --quick 50% 20% 5%.
         within: maximum loss of the recommended point against photos, dB. Without photos, the loss
             is estimated from renders.
         by: pruning methods, as for prune.
-        repairs: repairs to try: none, compact's efforts quick and thorough, or its --photos.
-        views: maximum number of views; without photos at most 12.
+        repairs: repairs to try: none, compact's efforts quick and thorough, or its --photos; by
+            default none quick, with --quick none.
+        views: maximum number of views; by default 12, with --quick 4; without photos at most 12.
+        quick: a first look: fewer budgets and views, no repairs, and frames of half the width.
         photos: folder of photos to judge by, for a scene without a run: every eighth photo, by
             name. Poses come from --poses, or from a camera file nearby.
     """
@@ -60,6 +72,7 @@ def tradeoff(
         by=by,
         repairs=repairs,
         views=views,
+        quick=quick,
         poses=view_options.poses,
         resolution=view_options.resolution,
         up=view_options.up,

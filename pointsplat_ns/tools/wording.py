@@ -368,6 +368,26 @@ def note_lines(report: Report) -> tuple[str, ...]:
     return tuple(lines)
 
 
+QUICK_NOTE = (
+    "a first look, measured with --quick: few budgets, frames of half the width, and no repairs "
+    "unless --repairs names them"
+)
+"""Note on a quick trade-off."""
+
+
+def tradeoff_estimate(points: int, gaussians: int, seconds: float, quick: bool) -> str:
+    """How long a trade-off will take, before it starts."""
+    if seconds < 60:
+        rough = f"{10 * max(1, round(seconds / 10))} s"
+    else:
+        rough = f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+    advice = "" if quick or seconds < 60 else "; --quick gives a first look"
+    return (
+        f"measuring {counted(points, 'point')} of {gaussians:,} Gaussians takes about {rough} on "
+        f"this machine{advice}"
+    )
+
+
 def log_report(report: Report) -> None:
     """Log a report: photos, searches and missing poses of a run at level INFO, details at level
     DEBUG."""

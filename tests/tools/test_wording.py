@@ -17,6 +17,7 @@ from pointsplat_ns.tools.wording import (
     search_text,
     sh_text,
     target_text,
+    tradeoff_estimate,
 )
 
 SOME = Quality(28.84, 24.2, 0.9132, 12, 1920, 1080, ViewOrigin(Origin.GIVEN), 33.84, 12.06)
@@ -94,3 +95,18 @@ def test_sh_that_stays_and_that_goes():
         "SH degree 3 cut to 1: colours change 25% less with the view, 41.0 dB PSNR against all "
         "bands"
     )
+
+
+@pytest.mark.parametrize(
+    ("seconds", "quick", "rough"),
+    [
+        (0.2, False, "10 s on this machine"),
+        (44.0, False, "40 s on this machine"),
+        (226.0, True, "4 min on this machine"),
+        (226.0, False, "4 min on this machine; --quick gives a first look"),
+        (9000.0, True, "2.5 h on this machine"),
+    ],
+)
+def test_a_duration_in_advance_has_few_digits(seconds, quick, rough):
+    said = tradeoff_estimate(13, 57_574, seconds, quick)
+    assert said == f"measuring 13 points of 57,574 Gaussians takes about {rough}"

@@ -12,13 +12,19 @@ import torch
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.pipeline.options import ViewOptions
-from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
 from pointsplat_ns.rendering import render
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.runs import name_of
 from pointsplat_ns.scene.views import ImageSize, sizes_text, spread_indices
-from pointsplat_ns.system.files import bytes_text, need_folder, need_new, replacing, three_digits
+from pointsplat_ns.system.files import (
+    bytes_text,
+    logger,
+    need_folder,
+    need_new,
+    replacing,
+    three_digits,
+)
 from pointsplat_ns.system.outputs import outputs_claimed
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
@@ -28,8 +34,10 @@ from pointsplat_ns.tools.tradeoff.measured_scene import make, subject_at
 from pointsplat_ns.tools.tradeoff.measuring import Measurer, busy_note, machine_text
 from pointsplat_ns.tools.tradeoff.points import (
     DENSE,
+    QUICK,
     REPAIRS,
     RESULTS,
+    WHOLE,
     ImageMetrics,
     Point,
     Setting,
@@ -37,7 +45,13 @@ from pointsplat_ns.tools.tradeoff.points import (
     write_points,
 )
 from pointsplat_ns.tools.tradeoff.recommend import next_best, recommend
-from pointsplat_ns.tools.wording import decibels, impression, views_of_size
+from pointsplat_ns.tools.wording import (
+    QUICK_NOTE,
+    decibels,
+    impression,
+    tradeoff_estimate,
+    views_of_size,
+)
 
 
 @normal_mode
@@ -46,11 +60,12 @@ def measure_tradeoff(
     scene: str | Path,
     folder: str | Path,
     *,
-    keep: Sequence[Keep | str] = ("70%", "50%", "30%", "20%", "10%", "5%"),
+    keep: Sequence[Keep | str] | None = None,
     within: float = 0.5,
     by: Sequence[str] = ("merge",),
-    repairs: Sequence[str] = ("none", "quick"),
-    views: int = VIEW_COUNTS.compared,
+    repairs: Sequence[str] | None = None,
+    views: int | None = None,
+    quick: bool = False,
     poses: str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
@@ -66,14 +81,19 @@ def measure_tradeoff(
         scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are used if
             available.
         folder: output folder for the figures (JSON) and the page.
-        keep: budgets, as for :func:`pointsplat_ns.prune` except a PSNR.
+        keep: budgets, as for :func:`pointsplat_ns.prune` except a PSNR; by default 70, 50, 30, 20,
+            10 and 5 %.
         within: maximum loss of the recommended point against photos, dB. Without photos, the loss
             is estimated from renders (:mod:`~pointsplat_ns.tools.tradeoff.recommend`). The fastest
             such point is recommended.
         by: methods, as for :func:`pointsplat_ns.prune`.
         repairs: some of "none", "quick" and "thorough", the efforts of
-            :func:`pointsplat_ns.compact`, and "photos", its training on the photos.
-        views: maximum number of timed views and of photos; without photos at most 12.
+            :func:`pointsplat_ns.compact`, and "photos", its training on the photos; by default
+            "none" and "quick".
+        views: maximum number of timed views and of photos, by default 12; without photos at most
+            12.
+        quick: by default measure only 50, 20 and 5 %, without repairs, in four views; timed and
+            drawn pictures have half the width.
         poses: camera file, as ``views`` of :func:`pointsplat_ns.prune`. The photos of a run are
             then not used, unless ``photos`` is given.
         resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged at this size, as by every
@@ -104,6 +124,10 @@ def measure_tradeoff(
         >>> [point.key for point in found.points]
         ['dense', '10pct']
     """
+    extent = QUICK if quick else WHOLE
+    keep = extent.keep if keep is None else keep
+    repairs = extent.repairs if repairs is None else repairs
+    views = extent.views if views is None else views
     check_options(keep, by, repairs, within, views)
     path = Path(scene)
     folder = Path(folder)
@@ -116,7 +140,10 @@ def measure_tradeoff(
         options = ViewOptions(poses=poses, resolution=resolution, up=up, data=data)
         subject = subject_at(path, options, own, report, "photos" in repairs)
         table = settings_of(subject.dense, keep, by, repairs)
-        measuring = _Measuring(Measurer(subject, views), within, folder)
+        measurer = Measurer(subject, views, extent.shrink)
+        seconds = measurer.expected_seconds(table)
+        logger.info(tradeoff_estimate(len(table), len(subject.dense), seconds, quick))
+        measuring = _Measuring(measurer, within, folder, QUICK_NOTE if quick else "")
         try:
             for number, setting in enumerate(table, start=1):
 
@@ -170,10 +197,11 @@ def settings_of(
 class _Measuring:
     """The points so far, and their pictures."""
 
-    def __init__(self, measurer: Measurer, within: float, folder: Path):
+    def __init__(self, measurer: Measurer, within: float, folder: Path, note: str = ""):
         self.measurer = measurer
         self.within = within
         self.folder = folder
+        self.note = note
         self.points: list[Point] = []
         self.shown = spread_indices(len(measurer.judged.views), 6)  # views with pictures
         photos = measurer.judged.photos
@@ -207,7 +235,7 @@ class _Measuring:
             height=measurer.judged.views.height,
             other_sizes=tuple(measurer.judged.views.image_sizes()[1:]),
             points=tuple(self.points),
-            notes=tuple(filter(None, (busy, measurer.note, note))),
+            notes=tuple(filter(None, (busy, measurer.note, self.note, note))),
             recommended=best.key,
             why=reason,
         )

@@ -32,6 +32,7 @@ from pointsplat_ns.scene.views import ImageSize, View, Views, sizes_text, spread
 from pointsplat_ns.system.cores import OtherPrograms, cores
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.threads import most_threads, now
+from pointsplat_ns.tools.tradeoff.estimate import measuring_seconds, unit_seconds
 from pointsplat_ns.tools.tradeoff.measured_scene import Subject
 from pointsplat_ns.tools.tradeoff.points import DENSE, ImageMetrics, Point, Setting, Speed
 from pointsplat_ns.tools.wording import origin_text
@@ -49,8 +50,8 @@ class JudgedViews(NamedTuple):
     origin: str
 
 
-def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
-    """At most ``count`` views of a middle size, and a note.
+def views_to_judge(subject: Subject, count: int, shrink: int = 1) -> tuple[JudgedViews, str]:
+    """At most ``count`` views of a middle size, divided by ``shrink``, and a note.
 
     They are views of held-out photos, which are reduced by averaging, or else the views of the
     :class:`~pointsplat_ns.pipeline.quality.Judge`. Raises DataError if there are none."""
@@ -59,6 +60,7 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
         try:
             views, photos = photos_with_views(subject.held_out(), count)
             small = views.each_size(functools.partial(_middle_sized, most=subject.resolution))
+            small = _shrunk(small, shrink)
             if small is not views:
                 photos = [_averaged(photo, view) for photo, view in zip(photos, small, strict=True)]
             origin = f"held-out photos of {subject.photos or 'the dataset'}"
@@ -67,13 +69,20 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
             note = f"there are no held-out photos: {error}"
     source = subject.new_views()
     views = source.compared().spread(min(count, VIEW_COUNTS.compared))
-    return JudgedViews(views, None, origin_text(source.origin)), note
+    return JudgedViews(_shrunk(views, shrink), None, origin_text(source.origin)), note
 
 
 def _middle_sized(views: Views, most: tuple[int, int] | None) -> Views:
     """Views of one size, reduced to the middle size of at most ``most`` pixels."""
     whole = views if most is None else views.resized(max(most))
     return views.resized(longer_side(middle_sized(whole)))
+
+
+def _shrunk(views: Views, by: int) -> Views:
+    """Views whose pictures have sides divided by a number."""
+    if by == 1:
+        return views
+    return views.each_size(lambda some: some.resized(longer_side(some) // by))
 
 
 def photos_with_views(photos: Photos, count: int) -> tuple[Views, list[Example]]:
@@ -116,17 +125,18 @@ def _averaged(photo: Example, view: View) -> Example:
 class Measurer:
     """Judges scenes as every command does, and measures frame times and errors against photos.
 
-    ``views`` is the maximum number of timed views and of photos. Raises SceneError if no Gaussian
-    can be drawn, and DataError if there are no views, or they are too small for SSIM."""
+    ``views`` is the maximum number of timed views and of photos, and ``shrink`` divides the size of
+    their pictures. Raises SceneError if no Gaussian can be drawn, and DataError if there are no
+    views, or they are too small for SSIM."""
 
-    def __init__(self, subject: Subject, views: int):
+    def __init__(self, subject: Subject, views: int, shrink: int = 1):
         need_usable(subject.dense)
         self.subject = subject
         self.dense = subject.dense
         self._dense_ms: float | None = None
         """Frame time of the dense scene, which is measured first: the unit of ratios."""
         self.judge = Judge(self.dense, subject.new_views())
-        self.judged, self.note = views_to_judge(subject, views)
+        self.judged, self.note = views_to_judge(subject, views, shrink)
         shown = self.judged.views
         if min(min(size[:2]) for size in shown.image_sizes()) < SSIM_WINDOW:
             size = f"{sizes_text(shown.image_sizes())} pixels"
@@ -159,6 +169,14 @@ class Measurer:
             seconds=seconds,
             others_cores=others_cores,
         )
+
+    @torch.no_grad()
+    def expected_seconds(self, settings: Sequence[Setting]) -> float:
+        """Estimated duration of measuring all points, seconds."""
+        view = self.judged.views[0]
+        frame = min(_timed(self.dense, view) for _ in range(2))
+        frames = ROUNDS * len(self.judged.views)
+        return measuring_seconds(settings, len(self.dense), frames, frame, unit_seconds())
 
     @torch.no_grad()
     def _against_photos(self, scene: Gaussians) -> ImageMetrics | None:

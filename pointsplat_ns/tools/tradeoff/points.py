@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 from pointsplat_ns.pipeline.repair_budget import Effort
+from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.scene.views import ImageSize
 from pointsplat_ns.system.files import write_json
 
@@ -18,6 +19,27 @@ REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
 EFFORTS: dict[Repair, Effort] = {"quick": "quick", "thorough": "thorough", "photos": "quick"}
 """Effort of ``compact`` by repair."""
+
+
+class Extent(NamedTuple):
+    """What a measurement covers by default."""
+
+    keep: tuple[str, ...]
+    """Budgets."""
+    repairs: tuple[Repair, ...]
+    views: int
+    """Maximum number of timed views and of photos."""
+    shrink: int
+    """Factor by which the timed and drawn pictures are smaller than a middle size."""
+
+
+WHOLE = Extent(
+    keep=("70%", "50%", "30%", "20%", "10%", "5%"),
+    repairs=("none", "quick"),
+    views=VIEW_COUNTS.compared,
+    shrink=1,
+)
+QUICK = Extent(keep=("50%", "20%", "5%"), repairs=("none",), views=4, shrink=2)
 
 DENSE = "dense"
 """Key and method of the dense scene."""

@@ -23,6 +23,7 @@ from pointsplat_ns.pipeline.view_provider import ViewProvider
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tools.tradeoff import measure_table as table
 from pointsplat_ns.tools.tradeoff import measuring
+from pointsplat_ns.tools.tradeoff.estimate import measuring_seconds, unit_seconds
 from pointsplat_ns.tools.tradeoff.measure_table import settings_of
 from pointsplat_ns.tools.tradeoff.measured_scene import Subject, make
 from pointsplat_ns.tools.tradeoff.measuring import views_to_judge
@@ -33,6 +34,7 @@ from pointsplat_ns.tools.tradeoff.recommend import (
     fastest_within,
     recommend,
 )
+from pointsplat_ns.tools.wording import QUICK_NOTE
 from trades import POINTS, point
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -79,6 +81,48 @@ def test_the_table_has_each_combination_once_and_each_a_key_fit_for_a_file(room)
     assert len(set(keys)) == len(keys) == 13 and all(
         re.fullmatch(r"[a-z0-9._-]+", key) for key in keys
     )
+
+
+def test_the_duration_is_told_before_the_first_point(measured, monkeypatch, caplog):
+    monkeypatch.setattr(measuring, "measuring_seconds", lambda settings, *_: 100.0 * len(settings))
+    monkeypatch.setattr(table, "make", mock.Mock(side_effect=KeyboardInterrupt))
+    with caplog.at_level("INFO"), pytest.raises(KeyboardInterrupt):
+        measured()
+    assert caplog.messages == [
+        "measuring 2 points of 400 Gaussians takes about 3 min on this machine; --quick gives a "
+        "first look"
+    ]
+
+
+def test_an_estimate_grows_with_the_work_and_shrinks_with_the_machine():
+    dense, merged, repaired, trained = (
+        Setting(50_000, by=DENSE),
+        *(Setting(5_000, repair) for repair in ("none", "quick", "photos")),
+    )
+    alone = [
+        measuring_seconds([setting], 50_000, frames=0, frame_seconds=0.0, unit=0.01)
+        for setting in (dense, merged, repaired, trained)
+    ]
+    assert alone[0] == 0 and alone == sorted(alone)
+    assert measuring_seconds([merged], 100_000, frames=0, frame_seconds=0.0, unit=0.01) > alone[1]
+    two = [merged, repaired]
+    slow = measuring_seconds(two, 50_000, frames=0, frame_seconds=0.0, unit=0.02)
+    assert slow == pytest.approx(2 * (alone[1] + alone[2]))
+    timed = measuring_seconds(two, 50_000, frames=36, frame_seconds=0.1, unit=0.02)
+    assert timed - slow == pytest.approx(2 * 36 * 0.1 * 1.1)  # of the dense scene, and of a tenth
+    assert 0 < unit_seconds() < 60
+
+
+def test_a_quick_look_has_fewer_points_of_the_same_scenes_in_smaller_frames(measured):
+    whole = measured(keep=["50%"])
+    quick = measured(keep=None, repairs=None, quick=True, force=True)
+    assert [point.key for point in quick.points] == ["dense", "50pct", "20pct", "5pct"]
+    assert quick.points[1].against_dense == whole.points[1].against_dense
+    assert quick.points[1].command == whole.points[1].command
+    assert (whole.width, whole.height, quick.width, quick.height) == (48, 36, 24, 18)
+    assert QUICK_NOTE in quick.notes and QUICK_NOTE not in whole.notes
+    chosen = measured(keep=["10%"], repairs=["quick"], quick=True, force=True)
+    assert [point.key for point in chosen.points] == ["dense", "10pct_quick"]
 
 
 def test_an_interruption_keeps_what_was_measured(measured, tmp_path, monkeypatch):
