@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.refinement.local_units import APPEARANCE, GEOMETRY
 from pointsplat_ns.scene.gaussians import MAX_SH_DEGREE
 
 _NAMES = {
@@ -165,11 +166,6 @@ class RefinerConfig:
             "use_appearance and use_position are switches of the encoder 'dual'; encoder 'concat' "
             "expects both on",
         )
-        _require(
-            self.encoder == "dual" or self.units == "scene",
-            "units is local, which the encoder 'concat' does not take; expected scene, or the "
-            "encoder 'dual'",
-        )
 
     @property
     def num_rest(self) -> int:
@@ -179,7 +175,10 @@ class RefinerConfig:
     @property
     def encoded_dim(self) -> int:
         """Channels per Gaussian that leave the encoder."""
-        return 14 + 3 * self.num_rest if self.encoder == "concat" else self.feature_dim
+        if self.encoder == "dual":
+            return self.feature_dim
+        attributes = GEOMETRY + APPEARANCE if self.units == "local" else 14
+        return attributes + 3 * self.num_rest
 
     @property
     def backbone_dim(self) -> int:

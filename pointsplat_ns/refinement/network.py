@@ -185,12 +185,14 @@ class DualBranchEncoder(nn.Module):
 
 
 class ConcatEncoder(nn.Module):
-    """All attributes side by side, as SplatFormer feeds them: 59 numbers at SH degree 3. No
-    parameters."""
+    """All attributes side by side, as SplatFormer feeds them: 59 numbers at SH degree 3, or 77 in
+    local units. No parameters."""
 
-    def forward(self, features: Features) -> Tensor:
-        """Concatenated Gaussians. # [N, 14 + 3 * num_rest]"""
+    def forward(self, features: Features | LocalFeatures) -> Tensor:
+        """Concatenated Gaussians. # [N, encoded_dim]"""
         f = features
+        if isinstance(f, LocalFeatures):
+            return torch.cat([f.geometry, f.appearance, f.features_rest], dim=1)
         return torch.cat(
             [f.positions, f.scales, f.quats, f.opacities, f.features_dc, f.features_rest], dim=1
         )

@@ -3,12 +3,11 @@ alone."""
 
 import math
 
-import pytest
 import torch
 
 from making import cloud, same, small_refiner
 from pointsplat_ns.geometry.transforms import rotation_matrices
-from pointsplat_ns.refinement import RefinerConfigError, refiner_preset
+from pointsplat_ns.refinement import refiner_preset
 from pointsplat_ns.refinement.local_units import (
     FEWEST_SIZES,
     NEIGHBOURS,
@@ -143,9 +142,15 @@ def test_refining_a_piece_alone_changes_little_away_from_the_cut():
     assert (whole.opacities - piece.opacities)[deep].abs().mean() < 0.5 * moved.abs().mean()
 
 
-def test_the_encoder_that_concatenates_is_refused():
-    with pytest.raises(RefinerConfigError, match="encoder 'dual'"):
-        refiner_preset("tiny", units="local", encoder="concat")
+def test_the_concatenating_encoder_has_all_of_the_local_features():
+    refiner = small_refiner(encoder="concat", units="local")
+    scene = scene_to_refine(40)
+    units = local_units(scene)
+    features = local_features(scene, units, refiner.config.num_rest, 0.1, torch.float64)
+    expected = [features.geometry, features.appearance, features.features_rest]
+    encoded = refiner.encoder(features)
+    assert torch.equal(encoded, torch.cat(expected, dim=1))
+    assert encoded.shape[1] == refiner.config.encoded_dim
 
 
 def test_a_preset_with_local_units_normalises_each_point_by_itself():

@@ -23,7 +23,13 @@ UNITS = pytest.mark.parametrize("units", ["scene", "local"])
 
 
 @pytest.mark.parametrize(
-    "changes", [{"encoder": "dual"}, {"encoder": "concat"}, {"units": "local"}]
+    "changes",
+    [
+        {"encoder": "dual"},
+        {"encoder": "concat"},
+        {"units": "local"},
+        {"encoder": "concat", "units": "local"},
+    ],
 )
 @pytest.mark.parametrize("duplicates", [False, True])
 def test_permuting_the_gaussians_permutes_the_result(duplicates, changes):
