@@ -2,11 +2,14 @@
 
     python -m lab.judge.refinement scenes/rock.ply scenes/bouquet.ply --refiners shipped=shipped \\
         --keep 0.1 0.3 0.5 --json docs/record/refinement.json
+    python -m lab.judge.refinement scenes/rock.ply outputs/office/splatfacto-cpu/RUN \\
+        --refiners shipped=shipped --json docs/record/refinement.json
 
-Each scene is pruned with the network's method, and its renders along a camera path written by hand
-are compared with those of the dense scene, over the pixels that this covers. The control adds one
+Each scene is pruned with the network's method. Renders of a PLY along a camera path written by hand
+are compared with those of the dense scene, over the pixels that this covers; those of a run with
+its held-out photos, in their size. The control adds one
 constant to all log-scales of the selection: the best of :data:`CONSTANTS` for each scene and
-budget, which knows the dense renders, as no network does. Residuals are taken whole, and nothing
+budget, which knows the pictures that judge, as no network does. Residuals are taken whole, and nothing
 checks them. The file is taken up: what it has of a scene is not measured again.
 """
 
@@ -26,7 +29,15 @@ import pointsplat_ns as ps
 from lab.common.printing import console, markdown, percent, start, table
 from lab.common.results import Results, Row, grouped, write_page
 from lab.judge.refiners import named
-from lab.judge.scenes import DenseViews, JudgedScene, check, check_options, load
+from lab.judge.scenes import (
+    PHOTOS,
+    DenseViews,
+    JudgedScene,
+    PhotoViews,
+    check,
+    check_options,
+    load,
+)
 
 CONSTANTS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.2)
 """Natural logarithms added to all log-scales; the best of them is the control."""
@@ -40,19 +51,33 @@ HEADS = ("kept", "way", "PSNR, dB", "over the selection", "worst scene", "over t
 
 PAGE = """# What one pass of a network brings over a selection
 
-`lab/judge/refinement.py` measured [{name}]({name}) and writes this page from it. PSNR is against
-renders of the dense scene, over the pixels that it covers, in {views} views of camera paths written
-by hand, {width} pixels wide. The best constant is one number added to all log-scales, chosen for
-each scene and budget by these same views: a control that knows the answer. The worst scene is the
-one where a way gains least over the selection. The figures hold for these scenes at this width; no
-network was trained on them.
-
+`lab/judge/refinement.py` measured [{name}]({name}) and writes this page from it. The best constant
+is one number added to all log-scales, chosen for each scene and budget by the pictures that judge:
+a control that knows the answer. The worst scene is the one where a way gains least over the
+selection. No network was trained on these scenes; the figures hold for them, at this size.
 """
+
+AGAINST = {
+    "renders": """
+## Against renders of the dense scene
+
+PSNR over the pixels that the dense scene covers, in {views} views of camera paths written by hand,
+{width} pixels wide.
+
+""",
+    PHOTOS: """
+## Against held-out photos
+
+PSNR in at most {views} held-out photos of each capture, in their size.
+
+""",
+}
+"""Heads of the parts of the page, by what rows were compared with."""
 
 
 def measured(
     scene: JudgedScene,
-    dense: DenseViews,
+    judge: DenseViews | PhotoViews,
     share: float,
     by: str,
     networks: dict[str, ps.TrainedRefiner],
@@ -65,7 +90,7 @@ def measured(
     kept = len(small) / len(scene.dense)
     ways: dict[str, Callable[[], ps.Gaussians]] = {
         SELECTION: lambda: small,
-        CONSTANT: lambda: max(grown.values(), key=dense.psnr),
+        CONSTANT: lambda: max(grown.values(), key=judge.psnr),
         MERGED: lambda: ps.prune(scene.dense, keep=share, by="merge"),
         **{name: functools.partial(refiner, small, kept) for name, refiner in networks.items()},
     }
@@ -76,8 +101,10 @@ def measured(
         begun = time.perf_counter()
         result = ways[way]()
         seconds = time.perf_counter() - begun
-        each = dense.psnrs(result)
+        each = judge.psnrs(result)
+        against = PHOTOS if isinstance(judge, PhotoViews) else "renders"
         row: Row = {"scene": scene.name, "digest": scene.digest, "keep": share, "by": by}
+        row["against"] = against
         row |= {"way": way, "count": len(result), "seconds": round(seconds, 2)}
         row |= {"psnr": round(fmean(each), 3), "worst_view": round(min(each), 3)}
         if way == CONSTANT:
@@ -127,8 +154,14 @@ def each_scene(rows: list[Row]) -> str:
 
 def page(rows: list[Row], name: str, views: int, width: int) -> str:
     """The Markdown page of all rows."""
-    head = PAGE.format(name=name, views=views, width=width)
-    return head + markdown(HEADS, lines(rows)) + "\n\n" + each_scene(rows) + "\n"
+    text = PAGE.format(name=name)
+    parts = grouped(rows, lambda row: row["against"])
+    for against, head in AGAINST.items():
+        of_kind = parts.get(against, [])
+        if of_kind:
+            text += head.format(views=views, width=width)
+            text += markdown(HEADS, lines(of_kind)) + "\n\n" + each_scene(of_kind) + "\n"
+    return text
 
 
 @torch.no_grad()
@@ -144,11 +177,12 @@ def main(
     """Measure networks beside the selection, the best constant on log-scales and the merge.
 
     Args:
-        scenes: PLY files that have a camera path of their name.
+        scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in
+            their held-out photos.
         refiners: NAME=RUN, NAME=FILE or NAME=shipped.
         keep: shares of the Gaussians to keep.
         by: pruning method.
-        width: of the pictures, pixels; the height is 9/16 of it.
+        width: of the pictures of camera paths, pixels; the height is 9/16 of it.
         views: at most so many views of each scene, evenly spread.
         json_path: write all rows there, after each scene, and the page of its name beside it.
     """
@@ -159,14 +193,17 @@ def main(
     for scene_name, path in zip(check(scenes), scenes, strict=True):
         scene = load(path, (width,), views)
         known = [row for row in results.of(scene_name) if row["digest"] == scene.digest]
-        dense = DenseViews(scene.dense, scene.looks[0].views)
+        look = scene.looks[0]
+        judge = PhotoViews(look) if look.photos else DenseViews(scene.dense, look.views)
         for share in keep:
             there = {row["way"] for row in known if row["keep"] == share and row["by"] == by}
-            new = measured(scene, dense, share, by, networks, there)
+            new = measured(scene, judge, share, by, networks, there)
             known = known + new
             results.put(scene_name, known)
         console().print(table(scene_name, HEADS, lines(known), left=HEADS[:2]))
-    console().print(table("mean over scenes", HEADS, lines(results.rows), left=HEADS[:2]))
+    for against, rows in grouped(results.rows, lambda row: row["against"]).items():
+        title = f"mean over scenes, against {against}"
+        console().print(table(title, HEADS, lines(rows), left=HEADS[:2]))
     if json_path is not None:
         write_page(json_path, lambda rows: page(rows, json_path.name, views, width))
 

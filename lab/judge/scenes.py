@@ -166,6 +166,23 @@ class DenseViews:
         ]
 
 
+class PhotoViews:
+    """Held-out photos of a run, and their poses: what :class:`DenseViews` is to renders."""
+
+    def __init__(self, look: Look):
+        assert look.photos is not None
+        self.pairs = list(zip(look.views, look.photos, strict=True))
+
+    def psnr(self, small: Gaussians) -> float:
+        """Mean PSNR against the photos, dB."""
+        return fmean(self.psnrs(small))
+
+    @torch.no_grad()
+    def psnrs(self, small: Gaussians) -> list[float]:
+        """PSNR against each photo, dB."""
+        return [finite_psnr(render(small, view), photo) for view, photo in self.pairs]
+
+
 @torch.no_grad()
 def losses(
     scene: JudgedScene, smalls: list[Gaussians], lpips: Lpips | None

@@ -25,6 +25,7 @@ from lab.judge import bytes as equal_bytes
 from making import box_room, move_zero_layers, run_of
 from peers import peer
 from pointsplat_ns.cli import main
+from pointsplat_ns.metrics import finite_psnr
 from pointsplat_ns.pruning.merging import MERGING, merge
 from pointsplat_ns.refinement import Refiner, refiner_preset, save_refiner
 from pointsplat_ns.scene.ply import write_ply
@@ -256,6 +257,24 @@ def test_a_refinement_is_measured_beside_the_best_constant(small, tmp_path):
     assert again[:4] == rows and [row["way"] for row in again[4:]] == ["other"]
     text = found.with_suffix(".md").read_text()
     assert "| 25 % | untrained |" in text and "| small | 25 % |" in text
+
+
+def test_a_refinement_of_a_run_is_judged_in_its_held_out_photos(trained_walls, small, tmp_path):
+    found = tmp_path / "rows.json"
+    run = run_of(trained_walls, "wall-a")
+    refinement.main((small, run), keep=(0.5,), width=64, views=2, json_path=found)
+    rows = rows_of(found)
+    assert [row["against"] for row in rows] == ["renders"] * 3 + ["photos"] * 3
+    [look] = scenes.load(run, (64,), 2).looks
+    pruned = ps.prune(ps.load(run), keep=0.5, by="paper")
+    values = [
+        finite_psnr(ps.render(pruned, view), photo)
+        for view, photo in zip(look.views, look.photos, strict=True)
+    ]
+    assert rows[3]["psnr"] == pytest.approx(sum(values) / len(values), abs=1e-3)
+    text = found.with_suffix(".md").read_text()
+    assert text.index("| small | 50 % |") < text.index("held-out photos of each")
+    assert text.index("held-out photos of each") < text.index("| wall-a | 50 % |")
 
 
 def scenes_psnr(path: Path, add: float) -> float:
