@@ -14,7 +14,9 @@ the poses of six captures and candidates gives 1.2, 1.3 and 0.75 without blur an
 leave-one-out tests, a capture's pose is likelier than a candidate in 89 % of cases. Blur does not
 separate poses from candidates any better, but is needed for views from within walls, which captures
 lack. Limiting the pitch of candidates to -50 to 10 degrees instead loses 0.2 dB on average over the
-six at 10 %, most if the estimated up direction is wrong. See ``docs/concepts/sampled_views.md``.
+six at 10 %, most if the estimated up direction is wrong.
+In a closed room, candidates beyond its walls are left out
+(:mod:`~pointsplat_ns.view_sampling.enclosure`). See ``docs/concepts/sampled_views.md``.
 """
 
 from __future__ import annotations
@@ -43,6 +45,7 @@ from pointsplat_ns.view_sampling.content import (
     thinned,
     thinning,
 )
+from pointsplat_ns.view_sampling.enclosure import enclosures, outside_of_a_room
 from pointsplat_ns.view_sampling.poses import level_directions, look_at, views_of
 from pointsplat_ns.view_sampling.settings import current_settings
 from pointsplat_ns.view_sampling.traces import PhotoTraces, log_widths, means_around
@@ -194,6 +197,11 @@ class Sampler:
         ]
 
     @cached_property
+    def _some_points(self) -> Tensor:
+        """Positions (p, 3) of at most about 2,500 targets, for :func:`enclosures`."""
+        return self.few.means[self._targets[:: max(1, len(self._targets) // 2500)]]
+
+    @cached_property
     def _floor(self) -> float:
         """Minimum height of cameras."""
         return float((self.few.means[self._targets].double() @ self.up.direction).quantile(0.05))
@@ -217,6 +225,11 @@ class Sampler:
         )
         candidates = views_of(drawn, *self.resolution, UNITS)
         likelihoods, shown = self.judged(candidates)
+        eyes = invert_rigid(candidates.viewmats.double())[:, :3, 3]
+        outside = outside_of_a_room(
+            enclosures(self._some_points, eyes), likelihoods, current_settings().room_enclosure
+        )
+        likelihoods = likelihoods.masked_fill(outside, -math.inf)
         taken = (
             likelihoods.topk(count).indices.tolist()
             if likeliest
