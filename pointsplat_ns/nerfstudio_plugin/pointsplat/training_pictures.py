@@ -109,4 +109,4 @@ def _thinned(points: Sequence[tuple[int, float]], count: int = 2000) -> Sequence
 
 def _save(figure: Any, path: Path) -> None:
     with replacing(path, named=False) as part:
-        figure.savefig(part, format="png", dpi=110)
+        figure.savefig(part, format="png", dpi=110, bbox_inches="tight")  # names are not cut
