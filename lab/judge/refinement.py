@@ -187,7 +187,7 @@ def main(
         json_path: write all rows there, after each scene, and the page of its name beside it.
     """
     check_options(scenes, keep, views, (width,))
-    networks = {name: ps.load_refiner(path) for name, path in map(named, refiners)}
+    networks = {name: ps.load_refiner(path, by=by) for name, path in map(named, refiners)}
     settings = {"views": views, "width": width}
     results = Results(json_path, settings, resume=json_path is not None)
     for scene_name, path in zip(check(scenes), scenes, strict=True):

@@ -74,10 +74,10 @@ def main(
         json_path: write all rows there, after each scene.
     """
     check_options(scenes, keep, views, (width,))
-    networks = [
-        (name, ps.load_refiner(None if path == "shipped" else path))
-        for name, path in map(named, refiners)
-    ]
+    asked = [named(text) for text in refiners]
+    networks = {
+        method: [(name, ps.load_refiner(path, by=method)) for name, path in asked] for method in by
+    }
     results = Results(json_path, {"views": views, "width": width}, resume=False)
     for scene_name, path in zip(check(scenes), scenes, strict=True):
         scene = load(path, (width,), views)
@@ -86,7 +86,7 @@ def main(
         for method, share in itertools.product(by, keep):
             small = ps.prune(scene.dense, keep=share, by=method)
             pruned = dense.psnr(small)
-            for number, (name, network) in enumerate(networks):
+            for number, (name, network) in enumerate(networks[method]):
                 row: Row = {
                     "scene": scene_name,
                     "digest": scene.digest,

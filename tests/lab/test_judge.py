@@ -259,6 +259,20 @@ def test_a_refinement_is_measured_beside_the_best_constant(small, tmp_path):
     assert "| 25 % | untrained |" in text and "| small | 25 % |" in text
 
 
+def test_the_shipped_network_is_that_of_the_selection(small, tmp_path):
+    options = {"keep": (0.5,), "width": 64, "views": 2, "json_path": tmp_path / "rows.json"}
+    scene = scenes.load(small, (64,), 2)
+    dense = scenes.DenseViews(scene.dense, scene.looks[0].views)
+    pruned = ps.prune(scene.dense, keep=0.5, by="paper")
+    expected = dense.psnr(ps.refine(pruned, ps.load_refiner(by="paper")))
+    assert expected != pytest.approx(dense.psnr(ps.refine(pruned, ps.load_refiner())), abs=1e-3)
+    refiners.main((small,), ("shipped=shipped",), by=("paper",), **options)
+    assert rows_of(tmp_path / "rows.json")[0]["psnr"] == expected
+    (tmp_path / "rows.json").unlink()
+    refinement.main((small,), ("shipped=shipped",), by="paper", **options)
+    assert rows_of(tmp_path / "rows.json")[-1]["psnr"] == pytest.approx(expected, abs=1e-3)
+
+
 def test_a_refinement_of_a_run_is_judged_in_its_held_out_photos(trained_walls, small, tmp_path):
     found = tmp_path / "rows.json"
     run = run_of(trained_walls, "wall-a")
