@@ -234,6 +234,7 @@ def small_config(data: Path, output_dir: Path, steps: int, **model):
     config.output_dir = output_dir
     config.max_num_iterations = steps
     config.experiment_name = "refiner"
+    config.rate_factor = 1.0
     config.pipeline.datamanager.data = config.data = data
     for name, value in {
         "size": "tiny",
@@ -250,8 +251,7 @@ def small_config(data: Path, output_dir: Path, steps: int, **model):
 def fast_config(data: Path, output_dir: Path, steps: int = 10, **model):
     """The method at a size for tests, at rates for the few steps that they take."""
     config = small_config(data, output_dir, steps, **model)
-    for group in config.optimizers.values():
-        group["optimizer"].lr *= 10
+    config.rate_factor = 10.0
     return config
 
 

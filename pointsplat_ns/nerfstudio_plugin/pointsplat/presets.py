@@ -89,6 +89,7 @@ def _preset(
     config = pointsplat_config()
     config.method_name = f"{METHOD_NAMES.refiner}-{name}"
     config.optimizers = adam(rates, eps)
+    config.rate_factor = 1.0
     scenes = ScenesDataManagerConfig(
         supervision="photos",  # section 4, Datasets: images of the scenes
         # section 4, Datasets: "two random images per scene"; the released code: 1 on Replica

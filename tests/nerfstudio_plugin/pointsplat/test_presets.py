@@ -27,6 +27,7 @@ FIELDS = {
     "schedule": ("step", "step"),
     "drop_at": (0.6, 0.7),
     "global_norm": (None, 2.0),
+    "rate_factor": (1.0, 1.0),
     "pipeline.datamanager.images_per_step": (2, 2),
     "pipeline.model.by": ("paper", "authors"),
     "pipeline.model.keep": ("30%", "30%"),

@@ -110,8 +110,7 @@ def test_losses_do_not_depend_on_what_stays_in_memory(three_rooms, run_training,
 @pytest.fixture(scope="module")
 def trained_on_rooms(three_rooms, run_training, tmp_path_factory):
     config = dense_config(three_rooms, tmp_path_factory.mktemp("refined"), steps=16)
-    for group in config.optimizers.values():
-        group["optimizer"].lr *= 10  # tests take few steps
+    config.rate_factor = 10.0
     config.pipeline.datamanager.eval_scenes = ("room2",)
     trainer, _ = run_training(config)
     return config, trainer

@@ -88,6 +88,17 @@ def test_the_method_is_the_papers_and_says_so():
     assert "merging" in text and "not the paper's" in text and "lambda" not in text
 
 
+@pytest.mark.parametrize(("by", "factor"), [("paper", 10.0), ("opacity", 10.0), ("merge", 1.0)])
+def test_scenes_that_a_score_selects_are_learned_at_higher_rates(by, factor):
+    config = pointsplat_config()
+    config.pipeline.model.by = by
+    config.check()
+    assert config.rate_factor == factor
+    config.rate_factor = 2.5
+    config.check()
+    assert config.rate_factor == 2.5
+
+
 @pytest.fixture(scope="module")
 def watched(trained_walls, run_training, tmp_path_factory):
     """A short training on wall-a, measured after each second step; what it printed, and the
