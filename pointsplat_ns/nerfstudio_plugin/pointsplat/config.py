@@ -75,8 +75,8 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     """Train for this time, in place of max_num_iterations: as many steps as fit, with a schedule
     that ends with it. The time before the checkpoint of load_dir is part of it."""
     rate_factor: float | None = None
-    """Multiplies all learning rates. By default 10 for scenes that a score selects, and 1 for merged
-    ones; with ten merged rooms or more, 3 learns faster and still generalises."""
+    """Multiplies all learning rates. By default 10 for scenes that a score selects, and 1 for
+    merged ones; with ten merged rooms or more, 3 learns faster and still generalises."""
     schedule: Literal["cosine", "step"] = "cosine"
     """How the rates fall: along a cosine after a short warm-up, or to a tenth at once."""
     drop_at: float = 0.6

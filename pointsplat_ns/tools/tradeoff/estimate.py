@@ -23,7 +23,7 @@ class Costs:
 
     ``python -m lab.speed.tradeoff_costs --scenes A B C`` finds them again, from merges and repairs
     of scenes of different size. Of two cuts of the example room and a bathroom, of 6,285 to 57,574
-    Gaussians, they give the CPU time of each within 7 %.
+    Gaussians, they give the CPU time of each within 8 %.
     """
 
     merge: float = 61.0
