@@ -1,7 +1,10 @@
 """Writes docs/record/results.md, its figures and the times in docs/tables.md from what ``python -m
 lab.tables`` measured.
 
-    python -m lab.judge.tables_record docs/record/results.json
+    python -m lab.judge.tables_record docs/record/results.json docs/record/results_320.json
+
+Several files are the same captures at several sizes, the most trustworthy first. What one of them
+lacks is taken from the next.
 
 The table of encoders is of ``encoders.json`` beside the page, which refiners.py measured, and the
 row of Replica of ``replica.json``, which replica_row.py wrote.
@@ -12,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -25,10 +29,11 @@ from lab.tables import sources
 from lab.tables.cells import Tables
 from lab.tables.curves import TUNED, last_gain, mean_curve, plot_curves
 from lab.tables.figure import plot_figure
-from lab.tables.findings import CLAIMS, OURS, paragraph
+from lab.tables.findings import CLAIMS, OURS, outcomes, paragraph
 from lab.tables.layout import HEADS, WRITTEN, Layout, Table, escaped, markdown_table
 from lab.tables.replica_row import section
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system.files import replacing
 
 MAIN = "captures"
@@ -53,9 +58,7 @@ TIMES = "times"
 
 PAGE = """# The paper's tables on {count} captures
 
-{finding}
-
-{ours}
+{findings}
 
 A difference is a mean over the captures ± its standard deviation over them, at 10 % of the Gaussians: of PSNR in
 held-out photos, or in percent how much less is drawn or waited for. A claim holds, or does not, if the mean is beyond
@@ -63,10 +66,11 @@ that spread.
 
 ## How it was measured
 
-`lab/judge/tables_record.py` writes this page from [results.json](results.json), which
+`lab/judge/tables_record.py` writes this page from
+{files}, which
 [`python -m lab.tables`](../tables.md) measured on [captures](../benchmarks.md#scenes) that no constant was chosen on.
 In a clone, with its kernels built (`python setup.py build_ext --inplace`), this makes a dense scene and measures one
-cell of each table, those below. Other cells are named in the same way; `results.json` has all:
+cell of each table, those below. Other cells are named in the same way; the files have all:
 
 ```bash
 python -m lab.judge.captures room35 clone captures/room35
@@ -82,12 +86,16 @@ The scenes:
 {scenes}
 
 - Protocols of rows with a network: *unseen*, the network saw other scenes only; *own photos*, it was trained on the
-  training photos of these captures, and other photos are held out. The program refuses any other weights.
+  training photos of these captures, and other photos are held out. The program refuses any other weights. In full
+  size, *unseen* is the refiner that ships for selections, and *own photos* continues from it for four minutes:
+  `ns-train pointsplat --data outputs --init shipped --pipeline.model.keep 10% --seconds 240`. At 320 pixels networks
+  were trained by `python -m lab.tables.networks captures -o networks --seeds 3 --steps 120`, and the dense scenes
+  are other trainings of the same captures.
 - PSNR is in dB. LPIPS is by AlexNet, LPIPS VGG by VGG. "-" was not measured.
 - \\*: nothing is fine-tuned or refined.
 - "made with": steps of fine-tuning, or encoder, size, steps, share and loss of the network.
-- ms a frame: on this CPU, by compiled kernels, and by torch alone; `python -m lab.speed.cuda` times a GPU, which none of
-  these rows was drawn on. Fill: Gaussians that a viewer draws on a pixel.
+- CPU ms a frame: of one thread, by compiled kernels, and by torch alone (at 320 pixels on the clock). None of these rows
+  was drawn on a GPU, which `python -m lab.speed.cuda` times. Fill: Gaussians that a viewer draws on a pixel.
 - Measured on {machines}.
 """
 
@@ -152,12 +160,49 @@ def shortened(table: Table) -> Table:
     return dataclasses.replace(table, header=tuple(header), rows=lines, notes=notes)
 
 
-def repeated(tables: Tables, names: list[str]) -> list[Row]:
+def main_names(tables: Tables) -> list[str]:
+    """The scenes of the finding."""
+    groups = tables.groups()
+    return groups.get(MAIN, next(iter(groups.values())))
+
+
+def size_of(tables: Tables) -> str:
+    """The size of the pictures that the captures were judged in."""
+    abouts = [tables.scenes[name] for name in main_names(tables)]
+    side = max(max(about["width"], about["height"]) for about in abouts)
+    reduced = any("photos reduced" in about["differs"] for about in abouts)
+    return f"{side} pixels" if reduced else f"full size, {side} pixels"
+
+
+def findings(all_tables: Sequence[Tables]) -> str:
+    """A paragraph on the claims of the paper and one on our rows, for each file. A claim that an
+    earlier file decided is not repeated; one that none has measured is named at the end."""
+    parts = []
+    left = {"paper": list(CLAIMS), "ours": list(OURS)}
+    for tables in all_tables:
+        names = main_names(tables)
+        heads = {"paper": f"Finding ({size_of(tables)}).", "ours": "Merging and compact."}
+        for kind, head in heads.items():
+            last = tables is all_tables[-1]
+            measured = {
+                outcome.claim: bool(outcome.differences)
+                for outcome in outcomes(left[kind], tables.cells, names)
+            }
+            shown = [claim for claim in left[kind] if measured[claim] or last]
+            left[kind] = [claim for claim in left[kind] if not measured[claim]]
+            if shown:
+                parts.append(
+                    _wrapped(f"**{head}** {escaped(paragraph(shown, tables.cells, names))}")
+                )
+    return "\n\n".join(parts)
+
+
+def repeated(tables: Tables) -> list[Row]:
     """A cell of one scene for a row of each table: Table 1 has the first, Tables 1 and 2 the
     second, Tables 3 and 4 the third."""
     found = []
-    first = sorted(names, key=lambda name: name != EXAMPLE)
-    for way in (WAYS.lightgaussian, WAYS.merge, WAYS.paper):
+    first = sorted(main_names(tables), key=lambda name: name != EXAMPLE)
+    for way in (WAYS.pointsplat.protocols[0], WAYS.merge, WAYS.paper):
         keys = (cell_key(name, way, PROTOCOL.ablation_share) for name in first)
         found += [tables.cells[key] for key in keys if key in tables.cells][:1]
     return found
@@ -181,23 +226,26 @@ def figures_of(cells: list[Row]) -> str:
 
 
 def not_measured(tables: Tables) -> str:
-    """The commands that fill the rows of networks that were not measured."""
-    reasons = [why for why in tables.missing.values() if "--refiners" in why]
+    """The commands that fill rows that were not measured; empty if all were."""
+    names = main_names(tables)
+    cells = WAYS.cells(PROTOCOL.shares)
+    if all(cell_key(name, way, share) in tables.cells for way, share in cells for name in names):
+        return ""
     return (
-        "\nRows without weights are filled by these networks, on other scenes and on these:\n\n"
+        "Rows that are not measured are filled by these commands: networks on other scenes, "
+        "networks on the photos of these, then all cells.\n\n"
         "```bash\n"
         "python -m lab.tables.networks other_outputs -o networks\n"
         "python -m lab.tables.networks outputs -o own_networks --own\n"
-        "python -m lab.tables outputs -o tables --refiners networks own_networks\n"
-        "```\n"
-        if reasons
-        else ""
+        "python -m lab.tables outputs -o tables --refiners shipped networks own_networks\n"
+        "```"
     )
 
 
-def curves(tables: Tables, names: list[str]) -> str:
+def curves(tables: Tables) -> str:
     """The figure of curves, and what their last halves gain; empty without curves."""
     gains = []
+    names = main_names(tables)
     for way in TUNED:
         curve = mean_curve(tables.cells, names, way, PROTOCOL.ablation_share)
         if curve:
@@ -211,25 +259,22 @@ def curves(tables: Tables, names: list[str]) -> str:
     )
 
 
-def times(tables: Tables) -> str:
+def times(all_tables: Sequence[Tables]) -> str:
     """The table of seconds that the cells of each way took, at the smallest share: made, and
-    judged; means over scenes."""
-    found: dict[str, list[tuple[float, float | None]]] = {}
-    for way, share in WAYS.cells(PROTOCOL.shares):
-        if share not in (1.0, PROTOCOL.ablation_share):
-            continue
-        for name in tables.scenes:
-            cell = tables.cells.get(cell_key(name, way, share))
-            if cell is not None:
-                point = cell["point"]
-                found.setdefault(_name(way), []).append((point["seconds"], point.get("judged")))
+    judged; means over scenes of the first file that has them, and its size."""
     seconds = number(1)
     lines = []
-    for label, both in found.items():
-        judged = [value for _, value in both if value is not None]
-        made = seconds(fmean(value for value, _ in both))
-        lines.append([label, made, seconds(fmean(judged)) if judged else "-"])
-    return markdown(["row, 10 %", "s to make", "s to judge"], lines)
+    for way, share in WAYS.cells(PROTOCOL.shares):
+        for tables in all_tables if share in (1.0, PROTOCOL.ablation_share) else ():
+            keys = (cell_key(name, way, share) for name in main_names(tables))
+            points = [tables.cells[key]["point"] for key in keys if key in tables.cells]
+            if points:
+                judged = [p["judged"] for p in points if "judged" in p]
+                made = seconds(fmean(p["seconds"] for p in points))
+                in_size = size_of(tables)
+                lines.append([_name(way), made, seconds(fmean(judged)) if judged else "-", in_size])
+                break
+    return markdown(["row, 10 %", "s to make", "s to judge", "in"], lines)
 
 
 def _wrapped(text: str) -> str:
@@ -242,11 +287,16 @@ def _name(way: Way) -> str:
     return escaped(f"{way.label}{weight}")
 
 
-def page(tables: Tables, record: Path) -> str:
-    """The page of all tables, that of encoders and the row of Replica from files in a folder."""
-    groups = tables.groups()
-    main_names = groups.get(MAIN, next(iter(groups.values())))
-    abouts = [tables.scenes[name] for names in groups.values() for name in names]
+def page(all_tables: Sequence[Tables], files: Sequence[str], record: Path) -> str:
+    """The page of all tables and their files; that of encoders and the row of Replica from files in
+    a folder."""
+    first = all_tables[0]
+    abouts = [
+        tables.scenes[name]
+        for tables in all_tables
+        for names in tables.groups().values()
+        for name in names
+    ]
     heads = ["scene", "judged in", "size", "differs from the paper in"]
     scenes = [
         [
@@ -257,24 +307,22 @@ def page(tables: Tables, record: Path) -> str:
         ]
         for about in abouts
     ]
-    examples = repeated(tables, main_names)
+    examples = repeated(first)
     text = PAGE.format(
-        count=len(main_names),
-        finding=_wrapped(f"**Finding.** {escaped(paragraph(CLAIMS, tables.cells, main_names))}"),
-        ours=_wrapped(
-            "**Merging and compact**, of this package. "
-            f"{escaped(paragraph(OURS, tables.cells, main_names))}"
-        ),
+        count=len(main_names(first)),
+        findings=findings(all_tables),
+        files=" and ".join(f"[{name}]({name})" for name in files),
         commands=commands(examples),
         examples=figures_of(examples),
         scenes=markdown(heads, [list(map(escaped, line)) for line in scenes]),
         machines="\n  and ".join(sorted({about["machine"] for about in abouts})),
     )
     shown = []
-    for group, names in groups.items():
-        short = map(shortened, Layout(tables, group, names, ()).tables())
-        shown += [f"## Tables: {escaped(group)}"]
-        shown += [markdown_table(table) for table in short if len(table.rows) > 1]
+    for tables in all_tables:
+        for group, names in tables.groups().items():
+            short = map(shortened, Layout(tables, group, names, ()).tables())
+            shown += [f"## Tables: {escaped(group)}, {size_of(tables)}"]
+            shown += [markdown_table(table) for table in short if len(table.rows) > 1]
     figure = (
         f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*"
     )
@@ -286,8 +334,8 @@ def page(tables: Tables, record: Path) -> str:
     parts = (
         text,
         *shown,
-        not_measured(tables),
-        curves(tables, main_names),
+        not_measured(first),
+        next((text for text in map(curves, all_tables) if text), ""),
         figure,
         of_replica,
         ENCODERS.format(table=compared),
@@ -296,21 +344,26 @@ def page(tables: Tables, record: Path) -> str:
     return "\n\n".join(part.strip() for part in parts if part.strip()) + "\n"
 
 
-def main(file: tyro.conf.Positional[Path], record: Path = FOLDER) -> None:
+def main(files: tyro.conf.Positional[tuple[Path, ...]], record: Path = FOLDER) -> None:
     """Write the record of the paper's tables.
 
     Args:
-        file: tables.json of ``python -m lab.tables``.
+        files: tables.json of ``python -m lab.tables``, of the same captures at several sizes, the
+            most trustworthy first.
         record: folder for results.md and its figures.
     """
-    tables = read(file)
-    groups = tables.groups()
+    if not files:
+        raise PointSplatError("no file is named; expected docs/record/results.json")
+    all_tables = [read(file) for file in files]
     with replacing(record / "results.md") as part:
-        part.write_text(page(tables, record), "utf-8")
-    plot_figure(tables.cells, groups, record / FIGURE)
-    plot_curves(tables.cells, groups.get(MAIN, next(iter(groups.values()))), record / CURVES)
+        part.write_text(page(all_tables, [file.name for file in files], record), "utf-8")
+    complete = max(all_tables, key=lambda tables: len(tables.cells))
+    plot_figure(complete.cells, complete.groups(), record / FIGURE)
+    drawn = next((tables for tables in all_tables if curves(tables)), None)
+    if drawn is not None:
+        plot_curves(drawn.cells, main_names(drawn), record / CURVES)
     guide = ROOT / "docs" / "tables.md"
-    text = put_between(guide.read_text("utf-8"), times(tables), guide, TIMES)
+    text = put_between(guide.read_text("utf-8"), times(all_tables), guide, TIMES)
     with replacing(guide) as part:
         part.write_text(text, "utf-8")
     print(record / "results.md")

@@ -29,7 +29,7 @@ READING = (
     "with its PSNR and the difference; among dense scenes it is the one of the least PSNR. The "
     "spread is the standard deviation of PSNR over "
     "trainings that differ by their seed. \\*: nothing is fine-tuned or refined. Milliseconds "
-    "compare on an idle machine alone."
+    "are of CPU time, all threads together."
 )
 
 OTHER_SCENES = "†"
@@ -170,7 +170,7 @@ class Layout:
             2,
             "Efficiency",
             first,
-            ["Gaussians", "MB", "ms a frame", "ms, torch alone", "fill", "scenes"],
+            ["Gaussians", "MB", "CPU ms a frame", "torch alone", "fill", "scenes"],
             rows,
             figures,
             None,

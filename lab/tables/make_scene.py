@@ -82,7 +82,8 @@ class Made:
 
     scenes: list[Gaussians]
     seconds: float
-    """Seconds of making one, with those of scores that other cells share."""
+    """CPU seconds of making one, with those of scores that other cells share; of another program,
+    seconds on the clock."""
     curve: Curve = field(default_factory=list)
     """PSNR over the steps of fine-tuning; empty without."""
 
@@ -102,7 +103,7 @@ class Maker:
         if its result cannot be read or the SH degree exceeds the refiner's, and DataError if there
         are no views."""
         dense = self.scene.dense
-        start = time.perf_counter()
+        start = time.process_time()
         if way == WAYS.dense:
             return Made([dense], 0.0)
         count = resolve_keep(len(dense), share, dense.sh_degree)
@@ -116,13 +117,13 @@ class Maker:
                 )
             return Made([scene.to(dense.device)], usage.seconds)
         if way.repaired:
-            return Made([ps.compact(path, count, data=data).scene], time.perf_counter() - start)
+            return Made([ps.compact(path, count, data=data).scene], time.process_time() - start)
         if method_named(way.by).score is None:
-            return Made([ps.prune(path, count, way.by, data=data)], time.perf_counter() - start)
+            return Made([ps.prune(path, count, way.by, data=data)], time.process_time() - start)
         if way.fine_tuned:
             return self._fine_tuned(way, share)
         scores, before = self._scored(way)
-        start = time.perf_counter()
+        start = time.process_time()
         scene = dense[select(scores, count)]
         made = [scene]
         if way.network is not None:
@@ -130,7 +131,7 @@ class Maker:
                 each.refiner(scene, share)
                 for each in self.tools.refiners.find(way, share, self.name)[0]
             ]
-        return Made(made, before + (time.perf_counter() - start) / len(made))
+        return Made(made, before + (time.process_time() - start) / len(made))
 
     def _fine_tuned(self, way: Way, share: float) -> Made:
         """The scene after all rounds of pruning and fine-tuning. Scores of the first round are
@@ -159,13 +160,13 @@ class Maker:
     def _score(self, way: Way, scene: Gaussians) -> tuple[Tensor, float]:
         """Scores (K,) of a scene, and the seconds of computing them."""
         method = method_named(way.by)
-        start = time.perf_counter()
+        start = time.process_time()
         views = self.scene.training.views
         if self.tools.options.scoring_views is not None:
             views = views.spread(self.tools.options.scoring_views)
         views = views.resized(max(1, max(views.width, views.height) // REDUCED.get(way.by, 1)))
         scores = score_of(scene, method, views if method.needs_views else None, way.opacity_weight)
-        return scores, time.perf_counter() - start
+        return scores, time.process_time() - start
 
 
 @dataclass(frozen=True, eq=False)

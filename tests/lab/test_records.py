@@ -24,8 +24,12 @@ def repairs_page(path: Path) -> str:
     return repairs.page(content["rows"], path.name, settings["views"], settings["width"])
 
 
+RESULTS = ("results.json", "results_320.json")
+
 PAGES = {
-    "results.md": lambda: tables_record.page(tables_record.read(RECORD / "results.json"), RECORD),
+    "results.md": lambda: tables_record.page(
+        [tables_record.read(RECORD / name) for name in RESULTS], RESULTS, RECORD
+    ),
     "speed.md": lambda: beside.page(json.loads((RECORD / "speed.json").read_text("utf-8"))["rows"]),
     "ablation.md": lambda: ablation.page(*record.read([RECORD / "ablation.json"], "ablation.py")),
     "large.md": lambda: large.page(json.loads((RECORD / "large.json").read_text("utf-8"))["rows"]),
