@@ -121,6 +121,12 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
                 "that are started by "
                 f"torchrun --nproc-per-node {number} --no-python ns-train {self.method_name}"
             )
+        if self.machine.seed != MachineConfig().seed:
+            raise PointSplatError(
+                f"--machine.seed {self.machine.seed} has no effect here; expected "
+                f"--pipeline.datamanager.seed {self.machine.seed}, which determines the first weights, "
+                "the order of scenes and photos, and their pieces"
+            )
         for name in ("rate_factor", "drop_at", "seconds", "global_norm"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:  # NaN fails too

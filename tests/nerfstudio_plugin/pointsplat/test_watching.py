@@ -99,6 +99,13 @@ def test_scenes_that_a_score_selects_are_learned_at_higher_rates(by, factor):
     assert config.rate_factor == 2.5
 
 
+def test_a_seed_that_has_no_effect_names_the_one_that_has():
+    config = pointsplat_config()
+    config.machine.seed = 7
+    with pytest.raises(PointSplatError, match="--pipeline.datamanager.seed 7"):
+        config.check()
+
+
 @pytest.fixture(scope="module")
 def watched(trained_walls, run_training, tmp_path_factory):
     """A short training on wall-a, measured after each second step; what it printed, and the
