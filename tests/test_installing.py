@@ -132,9 +132,9 @@ def test_command_says_what_it_lacks_in_one_line(outcomes):
 
 
 def test_requirements_are_what_is_imported():
-    core, more = (
+    core, more, cluster = (
         {canonicalize_name(requirement.name) for requirement in listed}
-        for listed in (CORE, NERFSTUDIO)
+        for listed in (CORE, NERFSTUDIO, map(Requirement, EXTRAS["cluster"]))
     )
     plugin = set()
     rest = set()
@@ -162,9 +162,8 @@ def test_requirements_are_what_is_imported():
         }  # shares its package with that without a window, which nerfstudio takes
 
     # open3d is imported nowhere: pyproject.toml says which of its versions nerfstudio can use
-    assert distributions(rest) <= core and distributions(plugin | rest) == (core | more) - {
-        "open3d"
-    }
+    assert distributions(rest) <= core | cluster
+    assert distributions(plugin | rest) == (core | more | cluster) - {"open3d"}
 
 
 def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(monkeypatch, tmp_path):

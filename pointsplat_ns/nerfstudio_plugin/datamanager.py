@@ -41,8 +41,8 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
     """Full images, undistorted, and pinhole cameras, in the order of nerfstudio's datamanager for
     the same seed.
 
-    Raises DataError if the dataparser finds no training photos. nerfstudio's own dataparsers end in
-    errors of all kinds then, such as a division by zero for one photo.
+    Raises DataError if the dataparser finds fewer than two photos. nerfstudio's own dataparsers end
+    in errors of all kinds then, such as a division by zero.
     """
 
     config: LazyImageDatamanagerConfig
@@ -50,18 +50,21 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
     """Name of the photo of the latest training step."""
 
     def __init__(self, config: LazyImageDatamanagerConfig, *args: Any, **kwargs: Any):
+        kind = type(config.dataparser).__name__.removesuffix("Config")
+        expected = "expected two or more photos with poses in the layout that it reads"
         try:
             with photos_alone():
                 super().__init__(config, *args, **kwargs)
         except PointSplatError:
             raise
         except (ArithmeticError, AssertionError, LookupError, OSError, ValueError) as error:
-            kind = type(config.dataparser).__name__.removesuffix("Config")
             raise DataError(
                 f"{config.data}: {kind} cannot load training photos from it "
-                f"({type(error).__name__}: {one_line(error, 120)}); expected two or more photos "
-                "with poses in the layout that it reads"
+                f"({type(error).__name__}: {one_line(error, 120)}); {expected}"
             ) from error
+        photos = {*self.train_dataset.image_filenames, *self.eval_dataset.image_filenames}
+        if len(photos) < 2:
+            raise DataError(f"{config.data}: {kind} finds one photo in it; {expected}")
 
     @cached_property
     def frame_cache(self) -> MemoryCache:

@@ -110,4 +110,7 @@ def _halves(along: Tensor) -> tuple[int, float, Tensor] | None:
     threshold = float(values.median())
     if threshold >= float(values.max()):  # half or more coincide at the upper end
         threshold = float(values[values < threshold].max())
-    return axis, threshold, values > threshold
+    upper = values > threshold
+    # between the two halves, so that rounding puts no position on the other side
+    between = 0.5 * (float(values[~upper].max()) + float(values[upper].min()))
+    return axis, between, upper

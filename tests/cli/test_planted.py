@@ -137,8 +137,9 @@ def test_each_place_that_starts_processes_is_known():
         if starts.search(path.read_text("utf-8"))
     }
     assert found == {
-        "pointsplat_ns/system/workers.py"
-    }  # Python itself, without the current folder on its path
+        "pointsplat_ns/system/cluster.py",  # asyncio, for a connection alone
+        "pointsplat_ns/system/workers.py",  # Python itself, without the current folder on its path
+    }
 
 
 HALF = ("--keep", "50%", "--by", "opacity", "--resolution", "32x24")

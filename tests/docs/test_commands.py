@@ -28,7 +28,14 @@ from pointsplat_ns.cli.help import EXAMPLES
 
 pytestmark = pytest.mark.usefixtures("quick")
 
-OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-print-completion"}
+OF_OTHERS = {
+    "--decimate",
+    "--eval_mode",
+    "--inplace",
+    "--no-build-isolation",
+    "--only-binary",
+    "--tyro-print-completion",
+}
 """Options that the documentation names and that belong to programs of others."""
 
 OTHERS = ("dask", "docker", "export", "git", "npm", "pip", "pre-commit", "tensorboard", "uv")

@@ -181,7 +181,10 @@ STEPS = {
     ),  # written with 5 bits of SH
     ".sog": (None, None, None, 1 / 255, 2**0.5 / 255),
     ".splat": (0.0, 1 / (255 * SH_C0), 0.0, 1 / 255, 1 / 128),
+    ".glb": (0.0, 0.0, 0.0, 0.0, 0.0),
+    ".gltf": (0.0, 0.0, 0.0, 0.0, 0.0),
 }
+STEPS[".spz.glb"] = STEPS[".spz"]
 
 
 @pytest.mark.parametrize(("degree", "n"), [(0, 2), (1, 257), (2, 600), (3, 1)])
