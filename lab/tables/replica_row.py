@@ -31,6 +31,9 @@ COMPARED = "merge,compact"
 
 TIMESTAMP = "run"
 
+EVALUATE = "evaluate"
+"""The step that compares, as :data:`COMPARED` says."""
+
 Step = tuple[str, str]
 """What a command does, and the command."""
 
@@ -53,7 +56,7 @@ def steps_of(
     words = {
         "train the scene": [*train, "--data", scene, "replica-data"],
         "train the refiner": [*tune, "--seconds", f"{seconds:g}"],
-        "evaluate": [*evaluate, "--output-path", output / "eval.json"],
+        EVALUATE: [*evaluate, "--output-path", output / "eval.json"],
         "export": export,
     }
     return [(what, shlex.join(map(str, command))) for what, command in words.items()]
@@ -152,8 +155,8 @@ def main(
         "scale": scale,
         "machine": machine_text(torch.device("cpu")),
         "commands": [
-            f"POINTSPLAT_COMPARE={COMPARED} {text}" if "ns-eval" in text else text
-            for _, text in commands
+            f"POINTSPLAT_COMPARE={COMPARED} {text}" if what == EVALUATE else text
+            for what, text in commands
         ],
         "cpu_seconds": spent,
         "refiner_steps": read_metadata(weights)["steps"],

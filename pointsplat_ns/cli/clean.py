@@ -47,7 +47,7 @@ def clean(
     if picture is not None:
         plot_cleaning(done, picture)
     log_lines(cleaning_lines(done.cleaning))
-    ps.save(done.scene, output, True, overwrite=True, spz_version=spz_version)
+    ps.save(done.scene, output, progress=True, overwrite=True, spz_version=spz_version)
     quality = quality_of_file(judge_of(done.dense, done.views), done.scene, output)
     before = len(done.dense)
     if json_output:

@@ -145,7 +145,7 @@ def compact(
     done = run.compact(scene, how, refiner, state_file=state_file, progress=True)
     log_report(done.report)
     report = done.report
-    ps.save(report.scene, output, True, overwrite=True, spz_version=how.spz)
+    ps.save(report.scene, output, progress=True, overwrite=True, spz_version=how.spz)
     remove_own(state_file)
     quality = quality_of_file(done.judge, report.scene, output)
     if quality is not None:

@@ -80,7 +80,7 @@ def convert(
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))
     after = ps.place(after, up, scale, scene if original_frame else None)
-    ps.save(after, output, True, overwrite=True, spz_version=spz_version)
+    ps.save(after, output, progress=True, overwrite=True, spz_version=spz_version)
     seconds = time.perf_counter() - start
     if json_output:
         print_json(scene_result(len(before), after, seconds, output))

@@ -76,7 +76,7 @@ def prune(
     small: ps.Gaussians | PlyRows | None = PlyRows.open(output) if in_parts else done.report.scene
     assert small is not None
     if not in_parts:
-        ps.save(done.report.scene, output, True, overwrite=True, spz_version=how.spz)
+        ps.save(done.report.scene, output, progress=True, overwrite=True, spz_version=how.spz)
     quality = None if in_parts else quality_of_file(done.judge, done.report.scene, output)
     before = done.report.count_before
     seconds = done.report.seconds

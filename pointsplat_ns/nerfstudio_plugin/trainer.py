@@ -93,9 +93,8 @@ class StoppableTrainerConfig(TrainerConfig):
         processes.by_first(write)
 
     def trainer(self, fitted: Any, **kwargs: Any) -> Trainer:
-        """The trainer of a copy of this config, fitted to the training; what it saves as
-        ``config.yml`` is this one."""
-        self.check()
+        """The trainer of a copy of this config, which is checked, fitted to the training; what it
+        saves as ``config.yml`` is this one."""
         trainer = self._target(fitted, **kwargs)
         trainer.given_config = self
         return trainer

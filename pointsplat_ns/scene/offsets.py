@@ -61,6 +61,10 @@ def warn_if_far(scene: Gaussians, path: Path | str) -> None:
         )
 
 
+OFFSET_COMMENT = "Offset: "
+"""Begins the comment, of a PLY or a RAD, that holds an offset as text."""
+
+
 def offset_text(offset: Offset) -> str:
     """An offset as text, such as ``451000.0 5411000.0 300.0``, exact to the bit."""
     return " ".join(repr(value) for value in offset)

@@ -17,7 +17,7 @@ import numpy as np
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.transforms import AXES, Direction
 from pointsplat_ns.scene.gaussians import Traits, is_direction
-from pointsplat_ns.scene.offsets import offset_of_text, offset_text
+from pointsplat_ns.scene.offsets import OFFSET_COMMENT, offset_of_text, offset_text
 from pointsplat_ns.system.files import logger
 
 _TYPES = {
@@ -147,7 +147,8 @@ def first_lines(traits: Traits) -> list[str]:
     if traits.up is not None:
         up = traits.up if isinstance(traits.up, str) else " ".join(map(repr, traits.up))
         comments.append(f"Vertical Axis: {up}")
-    comments += [] if traits.offset is None else [f"Offset: {offset_text(traits.offset)}"]
+    if traits.offset is not None:
+        comments.append(OFFSET_COMMENT + offset_text(traits.offset))
     return [
         "ply",
         "format binary_little_endian 1.0",
@@ -179,8 +180,8 @@ def traits_of(header: Header, path: Path) -> Traits:
             found = words[1] == "1"
         elif words[:2] == ["vertical", "axis"]:
             up = _up_of(words[2:], by_brush) or up
-        elif comment.startswith("Offset: "):  # three numbers to add to x, y and z
-            offset = offset_of_text(comment.removeprefix("Offset: "))
+        elif comment.startswith(OFFSET_COMMENT):  # three numbers to add to x, y and z
+            offset = offset_of_text(comment.removeprefix(OFFSET_COMMENT))
             if offset is None:
                 logger.warning(
                     "%s: no offset of three numbers in the comment %r", path, comment[:80]

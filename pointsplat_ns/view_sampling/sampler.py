@@ -248,7 +248,8 @@ class Sampler:
         widths = self._log_widths.exp().float()
 
         def look(index: int) -> tuple[float, Tensor]:
-            pixels = pixels_of(self.few, small[index])
+            view = small[index]
+            pixels = pixels_of(self.few, view)
             covered = float(pixels.double().sum())
             distances = (self.few.means - eyes[index].float()).norm(dim=1).clamp_min(1e-3)
             blur = 1.0  # radian, for an empty view
@@ -256,7 +257,6 @@ class Sampler:
                 blur = max(float((pixels * widths / distances).double().sum()) / covered, 1e-9)
             shown = pixels > 0.02  # sum of blending weights
             share = (float(shown.sum()) + 1) / len(pixels)
-            view = small[index]
             empty = max(0.0, 1 - covered / (view.width * view.height))
             return math.log(share) - math.log(empty + 0.01) - 2 * math.log(blur), shown
 

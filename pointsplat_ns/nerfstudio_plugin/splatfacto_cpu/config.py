@@ -67,6 +67,7 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
         A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes
         from, as if it had not been stopped.
         """
+        self.check()
         fitted = fitted_schedules(self) if self.scale_schedules else copy.deepcopy(self)
         return self.trainer(fitted, **kwargs)
 

@@ -21,7 +21,7 @@ from pointsplat_ns.geometry.transforms import (
 from pointsplat_ns.scene.formats.coding import joined
 from pointsplat_ns.scene.formats.gltf_container import Container, listed, numbers
 from pointsplat_ns.scene.gaussians import Gaussians, Offset, up_in_json
-from pointsplat_ns.scene.offsets import offset_for, offset_text
+from pointsplat_ns.scene.offsets import offset_for, offset_of_text, offset_text
 from pointsplat_ns.scene.rotation import Similarity, turned
 from pointsplat_ns.system.tensors import DOUBLES
 
@@ -203,8 +203,7 @@ def own_frame(traits: dict[str, Any]) -> tuple[Tensor, str | Direction | None, O
         raise ValueError(f"up is {traits['up']!r}, expected an axis or three numbers")
     offset = None
     if "offset" in traits:
-        x, y, z = numbers([float(word) for word in str(traits["offset"]).split()], 3)
-        offset = (x, y, z)
-        if max(map(abs, offset)) >= 1e15:
-            raise ValueError(f"an offset of {offset}")
+        offset = offset_of_text(str(traits["offset"]))
+        if offset is None:
+            raise ValueError(f"an offset of {traits['offset']!r}, expected three numbers")
     return torch.eye(3, **DOUBLES) if up is None else y_up_from(up).T, up, offset

@@ -23,7 +23,7 @@ from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.scene.formats import coding
 from pointsplat_ns.scene.formats.coding import Array, Blocks, shares_of_dc, to_bytes, unit_quats
 from pointsplat_ns.scene.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.scene.offsets import offset_of_text, offset_text
+from pointsplat_ns.scene.offsets import OFFSET_COMMENT, offset_of_text, offset_text
 from pointsplat_ns.system.files import require_file
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -100,7 +100,7 @@ def encode_rad(
     }
     head.update(chunkSize=_PAGE, allChunkBytes=offset, chunks=places, splatEncoding=encoding)
     if scene.offset is not None:
-        head["comment"] = f"Offset: {offset_text(scene.offset)}"
+        head["comment"] = OFFSET_COMMENT + offset_text(scene.offset)
     return b"".join([_described(MAGIC, head), *pages])
 
 
@@ -297,8 +297,10 @@ def _sh_of(columns: dict[str, Array], degree: int, kept: Array) -> Array:
 
 
 def _offset_of(head: dict[str, Any]) -> tuple[float, float, float] | None:
-    name, found, text = str(head.get("comment", "")).partition("Offset: ")
-    return offset_of_text(text) if found and not name else None
+    comment = str(head.get("comment", ""))
+    if not comment.startswith(OFFSET_COMMENT):
+        return None
+    return offset_of_text(comment.removeprefix(OFFSET_COMMENT))
 
 
 def _described(magic: bytes, content: dict[str, Any]) -> bytes:
