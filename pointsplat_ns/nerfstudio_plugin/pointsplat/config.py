@@ -124,8 +124,8 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         if self.machine.seed != MachineConfig().seed:
             raise PointSplatError(
                 f"--machine.seed {self.machine.seed} has no effect here; expected "
-                f"--pipeline.datamanager.seed {self.machine.seed}, which determines the first "
-                "weights, the order of scenes and photos, and their pieces"
+                f"--pipeline.datamanager.seed {self.machine.seed}, which determines the "
+                "initial weights, the order of scenes and photos, and the pieces"
             )
         for name in ("rate_factor", "drop_at", "seconds", "global_norm"):
             value = getattr(self, name)

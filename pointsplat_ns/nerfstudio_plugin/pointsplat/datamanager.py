@@ -67,8 +67,7 @@ class ScenesDataManagerConfig(DataManagerConfig):
     """Memory for decoded photos, dense and pruned scenes and renders; by default a quarter of the
     free memory. What does not fit is computed again when needed."""
     seed: int = 0
-    """Determines the weights that a training begins with, the order of scenes and photos, sampled
-    poses and pieces."""
+    """Determines the initial weights, the order of scenes and photos, sampled poses and pieces."""
 
 
 class ScenesDataManager(DataManager):
