@@ -74,11 +74,16 @@ OPTIONS = ("--keep", "50%", "--effort", "instant")
 @pytest.fixture()
 def rooms(tmp_path, monkeypatch) -> Path:
     """The current folder, with a folder of scenes, named without a path as people do."""
-    for seed in range(4):
-        scene = ball(100 + seed, seed=seed, log_size=-1.0, opacity=1.0, bright=1.0)
-        ps.save(scene, tmp_path / "rooms" / f"room{seed}.ply")
+    add_rooms(tmp_path, range(4))
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def add_rooms(folder: Path, numbers: range) -> None:
+    """Small scenes, named by their numbers, in the folder's `rooms`."""
+    for seed in numbers:
+        scene = ball(100 + seed, seed=seed, log_size=-1.0, opacity=1.0, bright=1.0)
+        ps.save(scene, folder / "rooms" / f"room{seed}.ply")
 
 
 def test_scenes_are_those_of_processes_although_a_worker_is_killed(rooms, cluster, capsys):
@@ -115,16 +120,18 @@ def test_ctrl_c_cancels_what_is_queued(rooms, cluster, capsys):
         wait_until(lambda: [*(rooms / "small").glob("*.ply")])
         os.kill(os.getpid(), signal.SIGINT)
 
+    count = 10  # many more than are done before the cancelling arrives, however slow the machine is
+    add_rooms(rooms, range(4, count))
     with meanwhile(interrupt), pytest.raises(SystemExit) as end:
         run("compact", "rooms", *OPTIONS, "-o", "small", "--cluster", cluster)
     assert end.value.code == 130 and capsys.readouterr().err.endswith("interrupted\n")
     with distributed.Client(scheduler_file=cluster, set_as_default=False) as client:
         wait_until(lambda: not any(client.run(at_work).values()))
     begun = len([*(rooms / "small").glob("*.ply")])
-    assert 1 <= begun <= 3, "the queue went on"
+    assert 1 <= begun < count, "the queue went on"
     run("compact", "rooms", *OPTIONS, "-o", "small", "--cluster", cluster)
     said = capsys.readouterr().out
-    assert said.count("done before") == begun and "4 of 4 scenes" in said
+    assert said.count("done before") == begun and f"{count} of {count} scenes" in said
 
 
 def test_a_large_scene_is_that_of_processes_although_a_worker_is_killed(
