@@ -61,8 +61,8 @@ PAGE = """# The paper's tables on {count} captures
 {findings}
 
 A difference is a mean over the captures ± its standard deviation over them, at 10 % of the Gaussians: of PSNR in
-held-out photos, or in percent how much less is drawn or waited for. A claim holds, or does not, if the mean is beyond
-that spread.
+held-out photos, or in percent how much lower LPIPS is, or how much less is drawn or waited for. A claim holds, or does
+not, if the mean is beyond that spread.
 
 ## How it was measured
 

@@ -12,9 +12,12 @@ from typing import Literal
 from lab.common.results import Row
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
 
-Measure = Literal["psnr", "fill", "frame_ms"]
+Measure = Literal["psnr", "lpips", "fill", "frame_ms"]
 
 FEW = PROTOCOL.ablation_share
+
+PUBLISHED: dict[Measure, int] = {"psnr": 0, "lpips": 2}
+"""Places of measures in the paper's rows."""
 
 
 class Verdict(Enum):
@@ -35,14 +38,15 @@ class Claim:
     than: tuple[Way, ...]
     """The best of these counts."""
     measure: Measure = "psnr"
-    """PSNR in held-out photos, dB; or fill or milliseconds of a frame, of which less is better."""
+    """PSNR in held-out photos, dB; or one of which less is better: LPIPS in them, fill,
+    milliseconds of a frame."""
     table: int = 1
     """Number of the paper's table that has both rows."""
     share: float = FEW
 
     def difference(self, cells: dict[str, Row], scene: str) -> float | None:
-        """How much better, dB, or in percent of the other's fill or time; None if a row lacks this
-        scene."""
+        """How much better: dB, or percent of the other's LPIPS, fill or time; None if a row lacks
+        this scene."""
         ours = self._value(cells.get(cell_key(scene, self.better, self.share)))
         theirs = [
             value
@@ -51,6 +55,9 @@ class Claim:
         ]
         if ours is None or len(theirs) < len(self.than):
             return None
+        return self._better_by(ours, theirs)
+
+    def _better_by(self, ours: float, theirs: Sequence[float]) -> float:
         if self.measure == "psnr":
             return ours - max(theirs)
         return 100 * (1 - ours / min(theirs))
@@ -59,21 +66,22 @@ class Claim:
         if cell is None:
             return None
         point = cell["point"]
-        if self.measure == "psnr":
-            return (point["against_photos"] or point["against_dense"])["psnr"]
+        if self.measure in PUBLISHED:
+            return (point["against_photos"] or point["against_dense"])[self.measure]
         return point.get(self.measure)
 
     def of_paper(self) -> dict[str, float]:
-        """The same difference of the paper's PSNR, dB, by dataset; of other measures none."""
+        """The same difference of the paper's PSNR, dB, or LPIPS, percent, by dataset; of other
+        measures none."""
         found = {}
-        for dataset in PROTOCOL.datasets if self.measure == "psnr" else ():
+        for dataset in PROTOCOL.datasets if self.measure in PUBLISHED else ():
             rows = [
                 published(self.table, dataset, way.name, self.share)
                 for way in (self.better, *self.than)
             ]
-            psnr = [row[0] for row in rows if row is not None]
-            if len(psnr) == len(rows):
-                found[dataset] = psnr[0] - max(psnr[1:])
+            values = [row[PUBLISHED[self.measure]] for row in rows if row is not None]
+            if len(values) == len(rows):
+                found[dataset] = self._better_by(values[0], values[1:])
         return found
 
 
@@ -93,6 +101,7 @@ CLAIMS = (
         _DUAL_OWN,
         (_PAPER,),
     ),
+    Claim("refining lowers LPIPS in scenes that the network never saw", _DUAL, (_PAPER,), "lpips"),
     Claim(
         "selecting by the score beats selecting at random, each refined by a concat network",
         _CONCAT,
@@ -121,6 +130,12 @@ CLAIMS = (
         "PointSplat, unseen, reaches what LightGaussian keeps without fine-tuning",
         _DUAL,
         (WAYS.lightgaussian,),
+    ),
+    Claim(
+        "refining a selection does not raise its fill",
+        _DUAL,
+        (_PAPER,),
+        "fill",
     ),
     Claim(
         "PointSplat, unseen, draws fewer Gaussians per pixel than fine-tuned LightGaussian",
@@ -202,7 +217,7 @@ paper: +1.6 on ScanNet++, +12.2 on Replica)'
         unit, digits = ("dB", 1) if self.claim.measure == "psnr" else ("%", 0)
         figures = f"{self.mean:+.{digits}f} ± {self.spread:.{digits}f} {unit}"
         theirs = ", ".join(
-            f"{value:+.1f} on {name}" for name, value in self.claim.of_paper().items()
+            f"{value:+.{digits}f} on {name}" for name, value in self.claim.of_paper().items()
         )
         return f"{words} ({figures}{f'; paper: {theirs}' if theirs else ''})"
 
