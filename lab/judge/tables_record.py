@@ -87,9 +87,9 @@ The scenes:
 
 - Protocols of rows with a network: *unseen*, the network saw other scenes only; *own photos*, it was trained on the
   training photos of these captures, and other photos are held out. The program refuses any other weights. In full
-  size, *unseen* is the refiner that ships for selections, and *own photos* continues from it for four minutes, whose
-  few steps ("made with") say nothing of a longer training:
-  `ns-train pointsplat --data outputs --init shipped --pipeline.model.keep 10% --seconds 240`. At 320 pixels networks
+  size, *unseen* is the refiner that ships for selections, and *own photos* continues from it for 50 minutes of a core
+  that other programs shared:
+  `ns-train pointsplat --data outputs --init shipped --pipeline.model.keep 10% --seconds 3000`. At 320 pixels networks
   were trained by `python -m lab.tables.networks captures -o networks --seeds 3 --steps 120`, and the dense scenes
   are other trainings of the same captures.
 - PSNR is in dB. LPIPS is by AlexNet, LPIPS VGG by VGG. "-" was not measured.
