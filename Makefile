@@ -48,4 +48,4 @@ demo: $(STAMP)
 	$(VENV)/bin/python -m lab.demo
 
 clean:
-	rm -rf pointsplat_ns/system/kernels.*.so build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis
+	rm -rf pointsplat_ns/system/kernels.*.so build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis lab/viewers/node_modules

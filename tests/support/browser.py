@@ -1,12 +1,13 @@
 """A headless Chromium that opens pages from disk."""
 
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
+
+from lab.viewers import packages
 
 SECONDS = 90
 """How long a test waits for what shall come; it takes a few on an idle machine."""
@@ -17,14 +18,12 @@ def chromium() -> Iterator:
     """A browser of its own, closed at the end. The test is skipped where Chromium or its driver is
     missing."""
     selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    programs = filter(
-        None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))
-    )
+    try:
+        found = packages.chromium()
+    except packages.Missing as reason:
+        pytest.skip(f"no page can be opened: {reason}")
     options = selenium.ChromeOptions()
-    driver = shutil.which("chromedriver")
-    options.binary_location = next(programs, "")
-    if not options.binary_location or driver is None:
-        pytest.skip("no Chromium with chromedriver on the path, so no page can be opened")
+    options.binary_location = found.program
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     arguments = [
         "--headless=new",
@@ -38,7 +37,8 @@ def chromium() -> Iterator:
     )  # Chromium has none for root
     for argument in arguments:
         options.add_argument(argument)
-    browser = selenium.Chrome(options=options, service=selenium.ChromeService(driver))
+    service = selenium.ChromeService(found.driver, env={**os.environ, **found.environment})
+    browser = selenium.Chrome(options=options, service=service)
     try:
         yield browser
     finally:

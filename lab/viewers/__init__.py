@@ -1,0 +1,1 @@
+"""Who opens what: files in the programs that draw them, beside the pictures of this package."""
