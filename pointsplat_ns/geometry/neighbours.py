@@ -1,14 +1,60 @@
-"""Nearest neighbours of points: exact, in float64; on a CPU with scipy's k-d tree."""
+"""Nearest neighbours of points: exact, in float64; on a CPU with compiled kernels
+(``point_tree.cpp``), or without them with scipy's k-d tree."""
 
 from __future__ import annotations
+
+import ctypes
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.geometry.box_tree import BoxTree
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    INT32_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.pieces import pieces
-from pointsplat_ns.system.tensors import FLOATS, numbers
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, numbers
 from pointsplat_ns.system.threads import most_threads, parallel_for
+
+
+class PointTreeStruct(Struct):
+    """``PointTree`` of ``point_tree.cpp``, which documents its members."""
+
+    members = {
+        "points": DOUBLE_POINTER,
+        "count": ctypes.c_int64,
+        "order": INT32_POINTER,
+        "leaves": DOUBLE_POINTER,
+        "boxes": DOUBLE_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+class NearestPointsStruct(Struct):
+    """``NearestPoints`` of ``point_tree.cpp``, which documents its members."""
+
+    members = {
+        "tree": PointTreeStruct,
+        "queries": DOUBLE_POINTER,
+        "queried": ctypes.c_int64,
+        "wanted": ctypes.c_int64,
+        "distances": DOUBLE_POINTER,
+        "indices": INT32_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+most_nearest_kernel = Function("pointsplat_most_nearest", result=ctypes.c_int64)
+build_tree_kernel = Function("pointsplat_build_tree", PointTreeStruct)
+nearest_kernel = Function("pointsplat_nearest", NearestPointsStruct, INT64_POINTER)
 
 QUERIES_AT_ONCE = 1 << 14
 """Number of points per search in a thread, to limit memory; eight times as many on a GPU."""
@@ -36,15 +82,54 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         nothing = torch.empty(0, 0, **FLOATS)
         return nothing.double(), nothing.long()
     places = points.detach().double().cpu()
-    return _CpuTree(places).nearest(places, min(k, n))
+    return _cpu_tree(places, min(k, n)).nearest(places, min(k, n))
 
 
 def import_tree() -> None:
-    """Import scipy in advance, because it takes long."""
-    import scipy.spatial  # noqa: F401
+    """Import scipy in advance where its tree is used, because it takes long."""
+    if not KERNELS.usable(None):
+        import scipy.spatial  # noqa: F401
 
 
-class _CpuTree:
+class _KernelTree:
+    """The twin of :class:`~pointsplat_ns.geometry.box_tree.BoxTree` with compiled kernels, for at
+    most :data:`most_nearest_kernel` neighbours of points (N, 3) float64."""
+
+    LEAF = 8  # points
+
+    def __init__(self, points: Tensor):
+        n = len(points)
+        leaves = -(-n // self.LEAF)
+        self._tree = PointTreeStruct(
+            points=points.contiguous(),
+            count=n,
+            order=torch.empty(n, dtype=torch.int32, device="cpu"),
+            leaves=torch.empty(leaves, 3, self.LEAF, **DOUBLES),
+            boxes=torch.empty(2 * leaves - 1, 6, **DOUBLES),
+        )
+        build_tree_kernel(self._tree)
+
+    @property
+    def order(self) -> Tensor:
+        order: Tensor = self._tree.references["order"]
+        return order.long()
+
+    def nearest(self, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        distances = torch.empty(len(queries), k, **DOUBLES)
+        indices = torch.empty(len(queries), k, dtype=torch.int32, device="cpu")
+        task = NearestPointsStruct(
+            tree=self._tree,
+            queries=queries.contiguous(),
+            queried=len(queries),
+            wanted=k,
+            distances=distances,
+            indices=indices,
+        )
+        on_threads(len(queries) >= SEVERAL, nearest_kernel, task)
+        return distances, indices.long()
+
+
+class _ScipyTree:
     """scipy's twin of :class:`~pointsplat_ns.geometry.box_tree.BoxTree`, points (N, D) float64."""
 
     def __init__(self, points: Tensor):
@@ -65,9 +150,16 @@ class _CpuTree:
         return torch.from_numpy(distances), torch.from_numpy(indices).long()
 
 
-def _tree_of(points: Tensor, k: int) -> _CpuTree | BoxTree:
+def _cpu_tree(points: Tensor, k: int) -> _KernelTree | _ScipyTree:
+    """A search tree of points (N, D) float64 on a CPU for at most ``k`` neighbours."""
+    if points.shape[1] == 3 and KERNELS.usable(None) and k <= most_nearest_kernel():
+        return _KernelTree(points)
+    return _ScipyTree(points)
+
+
+def _tree_of(points: Tensor, k: int) -> _KernelTree | _ScipyTree | BoxTree:
     """A search tree of points (N, 3) for at most ``k`` neighbours."""
-    return _CpuTree(points) if points.device.type == "cpu" else BoxTree(points, k)
+    return _cpu_tree(points, k) if points.device.type == "cpu" else BoxTree(points, k)
 
 
 def other_neighbours(points: Tensor, k: int) -> Tensor:

@@ -1,10 +1,12 @@
-"""Nearest neighbours, by either tree."""
+"""Nearest neighbours, by each of three trees."""
 
 import pytest
 import torch
 
 from pointsplat_ns.geometry import box_tree, neighbours
 from pointsplat_ns.geometry.neighbours import NearestOf, nearest, other_neighbours
+from pointsplat_ns.system.kernels import KERNELS
+from pointsplat_ns.system.threads import fixed_threads
 
 
 def points(n, d=3, seed=0, dtype=torch.float32):
@@ -26,10 +28,15 @@ def test_the_nearest_are_those_of_brute_force(k, dtype):
     torch.testing.assert_close(distances, wanted_distances, rtol=1e-12, atol=0)  # both in float64
 
 
-@pytest.fixture(params=["scipy", "torch"])
+@pytest.fixture(params=["kernels", "scipy", "torch"])
 def tree(request, monkeypatch):
-    """Each of both trees; of torch's, in several pieces, which are halved."""
-    if request.param == "torch":
+    """Each of the trees; of torch's, in several pieces, which are halved."""
+    if request.param == "kernels":
+        if not KERNELS.usable(None):
+            pytest.skip(KERNELS.why_missing)
+    elif request.param == "scipy":
+        monkeypatch.setattr(neighbours, "_tree_of", lambda points, k: neighbours._ScipyTree(points))
+    else:
         monkeypatch.setattr(neighbours, "_tree_of", box_tree.BoxTree)
         monkeypatch.setattr(box_tree.BoxTree, "PAIRS_AT_ONCE", 400)
 
@@ -63,7 +70,7 @@ def test_the_nearest_of_other_places_are_those_of_brute_force(n, tree):
     assert all(len(row.unique()) == min(6, n) for row in near)
 
 
-def test_the_tree_of_torch_is_exact_for_any_distribution():
+def test_each_tree_is_exact_for_any_distribution(tree):
     dense = points(2000, dtype=torch.float64)
     g = torch.Generator().manual_seed(1)
     for where in (
@@ -72,10 +79,25 @@ def test_the_tree_of_torch_is_exact_for_any_distribution():
         torch.cat([1e-6 * dense, dense, dense[:1].expand(900, 3)]),
         dense / torch.rand(2000, 1, generator=g) ** 3,
     ):
-        found = box_tree.BoxTree(where, 7).nearest(where, 7)[0]
-        torch.testing.assert_close(
-            found, nearest(where, 7)[0], rtol=1e-14, atol=0
-        )  # float64, in another order
+        found = neighbours._tree_of(where, 7).nearest(where, 7)[0]
+        wanted = by_brute_force(where, 7)[0]
+        # float64, in another order
+        torch.testing.assert_close(found, wanted, rtol=1e-14, atol=0)
+
+
+def test_any_number_of_threads_finds_the_same_neighbours():
+    where = points(9000, seed=2).double().round(decimals=1)  # many coincide
+    found = []
+    for count in (1, 3):
+        with fixed_threads(count):
+            found.append(other_neighbours(where, 6))
+    assert torch.equal(*found)
+
+
+def test_more_neighbours_than_the_kernel_keeps_are_found_too():
+    where = points(400)
+    distances, _ = nearest(where, 40)
+    torch.testing.assert_close(distances, by_brute_force(where, 40)[0], rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
