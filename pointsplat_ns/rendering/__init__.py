@@ -4,6 +4,7 @@ from pointsplat_ns.rendering.rasterize import rasterization
 from pointsplat_ns.rendering.render_scene import (
     pixel_sums,
     pixels_of,
+    pixels_of_each,
     render,
     render_depth,
     render_with_alpha,
@@ -12,6 +13,7 @@ from pointsplat_ns.rendering.render_scene import (
 __all__ = [
     "pixel_sums",
     "pixels_of",
+    "pixels_of_each",
     "rasterization",
     "render",
     "render_depth",

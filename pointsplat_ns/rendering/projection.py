@@ -255,7 +255,7 @@ def camera_of(
     return Camera(viewmat[:3, :3], centre, lens)
 
 
-def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
+def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> CameraStruct:
     """The :class:`Camera` as a struct for kernels."""
     rotation = tuple(view.flatten().tolist())
     steepness = lens.steepness()

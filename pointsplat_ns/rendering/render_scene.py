@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -150,6 +151,21 @@ def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Ten
     return pixel_sums(scene, view, single.means.new_ones(view.height, view.width, 1), compiled)[
         :, 0
     ]
+
+
+def pixels_of_each(scene: Gaussians, views: Views, compiled: bool | None = None) -> Tensor:
+    """:func:`pixels_of` in each of V views, (V, N), faster for many small images: they share one
+    call of the kernels, and each is drawn by one thread. Takes memory for one image per thread."""
+    single = _at_least_single(scene)
+    with one_thread_each():
+        left: Sequence[int] = range(len(views))
+        found = single.means.new_zeros(len(views), len(single))
+        if len(views) and pictures.can_draw(single, compiled):
+            cameras = [camera_to(scene, view) for view in views]
+            found, left = pictures.weights_of_each(single, cameras, ALPHA_MIN)
+        for index in left:
+            found[index] = pixels_of(single, views[index], compiled)
+    return found
 
 
 def pixel_sums(scene: Gaussians, view: View, maps: Tensor, compiled: bool | None = None) -> Tensor:

@@ -9,6 +9,8 @@ rounding.
 from __future__ import annotations
 
 import ctypes
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,7 +21,12 @@ from pointsplat_ns.rendering import projection
 from pointsplat_ns.rendering.blending import tiled, untiled
 from pointsplat_ns.rendering.compiled import blending_kernels as blending
 from pointsplat_ns.rendering.compiled import tile_kernels as tiles
-from pointsplat_ns.rendering.constants import MEMORY_BUDGET
+from pointsplat_ns.rendering.constants import (
+    ALPHA_MAX,
+    MEMORY_BUDGET,
+    SLACK,
+    TRANSMITTANCE_MIN,
+)
 from pointsplat_ns.rendering.ellipses import Grid, TileList
 from pointsplat_ns.rendering.projection import (
     Camera,
@@ -32,6 +39,7 @@ from pointsplat_ns.rendering.quadratics import PIXELS
 from pointsplat_ns.rendering.spherical_harmonics import zeros_like
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.kernels import (
+    ANY_POINTER,
     DOUBLE_POINTER,
     FLOAT_POINTER,
     INT64_POINTER,
@@ -83,6 +91,23 @@ class PlacingGradientStruct(Struct):
     _fields_ = c_fields(members)
 
 
+class WeighingStruct(Struct):
+    """``Weighing`` of ``whole_pictures.cpp``, which documents its members."""
+
+    members = {
+        "placing": PlacingStruct,
+        "cameras": ANY_POINTER,
+        "views": ctypes.c_int64,
+        "drawing": blending.TaskStruct,
+        "slack": ctypes.c_float,
+        "most_pairs": ctypes.c_int64,
+        "weights": FLOAT_POINTER,
+        "left_out": INT64_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+weigh_views_kernel = Function("pointsplat_weigh_views", WeighingStruct, INT64_POINTER)
 place_kernel = Function("pointsplat_place", PlacingStruct, INT64_POINTER)
 place_back_kernel = Function("pointsplat_place_back", PlacingGradientStruct, INT64_POINTER)
 
@@ -217,6 +242,36 @@ def weights(scene: Gaussians, camera: Camera, alpha_min: float) -> Tensor | None
     return blending.weigh(
         blending.task_of(placed.table, placed.grid, pairs, offsets, offsets), pairs, len(scene)
     )
+
+
+def weights_of_each(
+    scene: Gaussians, cameras: Sequence[Camera], alpha_min: float
+) -> tuple[Tensor, list[int]]:
+    """:func:`weights` in each of V small images, (V, N), in one call; and the indices of the images
+    with too many pairs of Gaussian and tile for one pass, which are left out: their rows are 0."""
+    tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
+    structs = (CameraStruct * len(cameras))(
+        *(projection.camera_struct(*camera) for camera in cameras)
+    )
+    found = torch.zeros(len(cameras), len(scene), **FLOATS)
+    left_out = torch.empty(len(cameras), **INDICES)
+    task = WeighingStruct(
+        placing=PlacingStruct(scene=projection.scene_struct(*tensors), degree=-1),
+        cameras=ctypes.addressof(structs),
+        views=len(cameras),
+        drawing=blending.TaskStruct(
+            log2_alpha_min=math.log2(alpha_min),
+            alpha_min=alpha_min,
+            alpha_max=ALPHA_MAX,
+            transmittance_min=TRANSMITTANCE_MIN,
+        ),
+        slack=SLACK,
+        most_pairs=MOST_PAIRS,
+        weights=found,
+        left_out=left_out,
+    )
+    on_threads(len(cameras) * len(scene) >= SEVERAL, weigh_views_kernel, task)
+    return found, left_out.nonzero()[:, 0].tolist()
 
 
 def can_draw(scene: Gaussians, wanted: bool | None) -> bool:

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from making import assert_same_on_any_threads, normal_scene
-from pointsplat_ns.rendering import pixels_of, render
+from pointsplat_ns.rendering import pixels_of, pixels_of_each, render
 from pointsplat_ns.rendering import render_scene as drawing
 from pointsplat_ns.rendering import whole_pictures as pictures
-from pointsplat_ns.scene.views import View
+from pointsplat_ns.scene.views import ImageSize, View, Views
 from pointsplat_ns.system.kernels import KERNELS
 
 WIDTH = 67
@@ -118,6 +118,34 @@ def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monk
     for ours, others in zip(at_once, drawing.render_with_alpha(scene, view, quality), strict=True):
         torch.testing.assert_close(ours, others, rtol=0, atol=1e-6)
     torch.testing.assert_close(pixels_of(scene, view), pixels, rtol=1e-5, atol=1e-4)
+
+
+@needs_compiler
+@torch.no_grad()
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_pixels_of_each_view_are_those_of_one_view_at_a_time(mode, monkeypatch):
+    scene = scene_of(count=3000)
+    view = view_of(mode)
+    viewmats = view.viewmat.repeat(5, 1, 1)
+    viewmats[:, 2, 3] += torch.arange(5).to(viewmats)  # from farther and farther away
+    sizes = [ImageSize(view.width, view.height), ImageSize(40, 72)]
+    views = Views(
+        viewmats,
+        view.K.repeat(5, 1, 1),
+        view.width,
+        view.height,
+        view.background,
+        near_plane=view.near_plane,
+        rasterize_mode=mode,
+        images=[sizes[index % 2] for index in range(5)],
+    )
+    wanted = torch.stack([pixels_of(scene, one) for one in views])
+    assert wanted.any(1).all() and torch.equal(pixels_of_each(scene, views), wanted)
+    assert pixels_of_each(scene, views[:0]).shape == (0, 3000)
+    monkeypatch.setattr(pictures, "MOST_PAIRS", 10)  # too many pairs: one view at a time
+    torch.testing.assert_close(pixels_of_each(scene, views), wanted, rtol=1e-5, atol=1e-4)
+    torchs = pixels_of_each(scene, views, compiled=False)
+    assert ((torchs - wanted).abs() > 1e-3 * (1 + wanted)).float().mean() < 0.02
 
 
 @needs_compiler

@@ -118,7 +118,7 @@ int64_t find_candidates(const Camera& camera, const Scene& scene, int64_t first,
 
 // The ellipses of Gaussians in the image, and which of them are drawn.
 struct Flat {
-    Lane x, y, xx, xy, yy, det, alpha, radius;  // xx and yy with eps2d
+    Lane x, y, xx, xy, yy, det, alpha, log2_alpha, radius;  // xx and yy with eps2d
     Mask drawn;
 
     Flat(const Camera& camera, const Position& at, const Shape& shape, Lane opacity) {
@@ -128,7 +128,8 @@ struct Flat {
         const Lane half = xx - yy, mid = 0.5f * (xx + yy);
         radius = 3.0f * root(mid + root(0.25f * (half * half) + xy * xy));
         // squared Mahalanobis distance of the 1/255 ellipse
-        const Lane level = 2.0f * each(alpha / camera.alpha_min, [](float value) { return std::log(value); });
+        log2_alpha = each(alpha, [](float value) { return std::log2(value); });
+        const Lane level = (log2_alpha - std::log2(camera.alpha_min)) * (2.0f * LN2);
         const Lane half_x = root(larger(level * xx, ZERO)), half_y = root(larger(level * yy, ZERO));
         drawn = (level > 0.0f) & is_finite(level) & is_finite(det) & (det > 0.0f);
         drawn &= (radius > camera.radius_clip) & is_finite(x) & is_finite(y);

@@ -3,9 +3,14 @@
 // pictures.py calls this file where it was built, and lists the tiles and blends as for any picture between both. It does
 // what projection.cpp and colors.cpp do one after the other, without what lies between.
 
+#include <numeric>
+#include <vector>
+
+#include "blending.h"
 #include "camera.h"
 #include "gradients.h"
 #include "harmonics.h"
+#include "tiles.h"
 
 extern "C" {
 
@@ -29,6 +34,18 @@ struct PlacingGradient {
     // By the parameters of the scene, of which the standard deviations and opacities are exponentials and sigmoids: zeros
     // before; or null.
     float *means, *quats, *scales, *opacities, *first, *rest;
+};
+
+// Blending weights of Gaussians, summed over the pixels of each of several pictures.
+struct Weighing {
+    Placing placing;        // of no colours, without camera, table and lists
+    const Camera* cameras;  // [V]
+    int64_t views;          // V
+    Task drawing;           // its constants
+    float slack;
+    int64_t most_pairs;  // of Gaussian and tile in a picture
+    float* weights;      // [V, N], zeros before
+    int64_t* left_out;   // [V] whether a picture has more pairs, and is left out
 };
 
 }  // extern "C"
@@ -66,8 +83,7 @@ int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to, int64_t
     const Camera& camera = task.camera;
     const Position at(camera, lanes, task.scene.means);
     const Flat flat(camera, at, Shape(camera, at, lanes, task.scene), lanes.load(task.scene.opacities));
-    const Lane base = each(flat.alpha, [](float value) { return std::log2(value); });
-    const Lane rows[GEOMETRY] = {flat.x, flat.y, flat.xy / flat.yy, LOG2E * flat.yy / flat.det, LOG2E / flat.yy, base};
+    const Lane rows[GEOMETRY] = {flat.x, flat.y, flat.xy / flat.yy, LOG2E * flat.yy / flat.det, LOG2E / flat.yy, flat.log2_alpha};
     float colors[LANES][3];
     if constexpr (DEGREE >= 0) color_lanes<DEGREE>(task, lanes, at, colors);
     for (int lane = 0; lane < lanes.count; ++lane) {
@@ -144,9 +160,89 @@ void place_back_all(const PlacingGradient& task, int64_t* next) {
     });
 }
 
+// Memory of a thread for one picture after another.
+struct Workspace {
+    std::vector<float> table, sorted, depths, sums;
+    std::vector<double> exact;
+    std::vector<int64_t> ids, counts, spoilt, order, places, offsets, pairs;
+    std::vector<int32_t> boxes;
+    std::vector<Strip> strips;
+};
+
+// Places the Gaussians of a picture, and writes which are drawn, front to back, and their rows of the table.
+void place_in_order(Placing& placing, Workspace& work) {
+    const int64_t count = placing.scene.count, ranges = (count + RANGE - 1) / RANGE;
+    work.table.resize(GEOMETRY * count), work.exact.resize(count), work.ids.resize(count);
+    work.counts.resize(ranges), work.spoilt.resize(ranges);
+    placing.table = work.table.data(), placing.ids = work.ids.data(), placing.depths = work.exact.data();
+    placing.counts = work.counts.data(), placing.spoilt = work.spoilt.data();
+    int64_t next = 0, drawn = 0;
+    place_all<-1>(placing, &next);
+    double nearest = std::numeric_limits<double>::infinity();
+    for (int64_t range = 0; range < ranges; ++range)
+        for (int64_t at = range * RANGE; at < range * RANGE + work.counts[range]; ++at, ++drawn) {
+            work.ids[drawn] = work.ids[at], work.exact[drawn] = work.exact[at];
+            nearest = std::min(nearest, work.exact[at]);
+        }
+    work.depths.resize(drawn), work.order.resize(drawn);
+    for (int64_t at = 0; at < drawn; ++at) work.depths[at] = static_cast<float>(work.exact[at] - nearest);
+    ::pointsplat_by_depth(work.depths.data(), drawn, work.order.data());
+    work.sorted.resize(GEOMETRY * drawn), work.places.resize(drawn);
+    std::iota(work.places.begin(), work.places.end(), 0);
+    for (int64_t at = 0; at < drawn; ++at) {
+        const int64_t id = work.order[at] = work.ids[work.order[at]];
+        std::copy_n(work.table.data() + GEOMETRY * id, GEOMETRY, work.sorted.data() + GEOMETRY * at);
+    }
+}
+
+// Adds the weights of one picture; returns whether it is left out.
+bool weigh_view(const Weighing& all, int64_t view, Workspace& work) {
+    Placing placing = all.placing;
+    const Camera& camera = placing.camera = all.cameras[view];
+    place_in_order(placing, work);
+    const int64_t drawn = work.order.size();
+    Listing listing = {};
+    listing.table = work.sorted.data(), listing.stride = GEOMETRY, listing.order = work.places.data(), listing.count = drawn;
+    listing.height = static_cast<int64_t>(camera.height);
+    listing.rows = listing.bottom = (listing.height + TILE - 1) / TILE;
+    listing.columns = (static_cast<int64_t>(camera.width) + TILE - 1) / TILE;
+    listing.log2_alpha_min = all.drawing.log2_alpha_min, listing.slack = all.slack;
+    work.boxes.resize(4 * drawn);
+    listing.boxes = work.boxes.data();
+    int64_t next = 0, strips = 0;
+    ::pointsplat_boxes(&listing, &next);
+    for (int64_t at = 0; at < drawn; ++at) strips += std::max(listing.boxes[4 * at + 1] - listing.boxes[4 * at] + 1, 0);
+    const int64_t tiles = listing.rows * listing.columns;
+    work.strips.resize(strips), work.offsets.assign(tiles + 1, 0);
+    listing.strips = work.strips.data(), listing.offsets = work.offsets.data();
+    ::pointsplat_count(&listing);
+    for (int64_t tile = 0; tile < tiles; ++tile) work.offsets[tile + 1] += work.offsets[tile];
+    const int64_t pairs = work.offsets[tiles];
+    if (pairs > all.most_pairs) return true;
+    work.pairs.resize(pairs), work.sums.resize(pairs);
+    listing.gaussians = work.pairs.data();
+    ::pointsplat_list(&listing);
+    Task task = all.drawing;
+    task.table = work.sorted.data(), task.gaussians = work.pairs.data(), task.offsets = task.chunks = work.offsets.data();
+    task.tiles = tiles, task.columns = listing.columns, task.channels = 0, task.sums = work.sums.data();
+    task.width = static_cast<int64_t>(camera.width), task.height = listing.height;
+    next = 0;
+    ::pointsplat_weigh(&task, &next);
+    float* weights = all.weights + view * placing.scene.count;
+    for (int64_t pair = 0; pair < pairs; ++pair) weights[work.order[work.pairs[pair]]] += work.sums[pair];  // in the order of tiles
+    return false;
+}
+
 }  // namespace
 
 extern "C" {
+
+// One thread weighs a whole picture.
+void pointsplat_weigh_views(const Weighing* task, int64_t* next) {
+    Workspace work;
+    for (int64_t view; (view = __atomic_fetch_add(next, 1, __ATOMIC_RELAXED)) < task->views;)
+        task->left_out[view] = weigh_view(*task, view, work);
+}
 
 void pointsplat_place(const Placing* task, int64_t* next) {
     switch (task->degree) {
