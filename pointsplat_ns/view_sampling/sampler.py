@@ -31,10 +31,11 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import curve_keys, invert_rigid, unit_cells
-from pointsplat_ns.rendering import pixels_of
+from pointsplat_ns.rendering import pixels_of_each
 from pointsplat_ns.rendering.comparison.sizes import RESOLUTION
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
+from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.system.threads import parallel_map
 from pointsplat_ns.view_sampling.content import (
@@ -50,6 +51,9 @@ from pointsplat_ns.view_sampling.poses import level_directions, look_at, views_o
 from pointsplat_ns.view_sampling.settings import current_settings
 from pointsplat_ns.view_sampling.traces import PhotoTraces, log_widths, means_around
 from pointsplat_ns.view_sampling.upright import Surface, Up, checked_up, known_up, upright
+
+VIEWS_AT_ONCE = 16
+"""Number of candidates that a thread judges at a time: their numbers fit into its cache."""
 
 
 @torch.no_grad()
@@ -246,30 +250,36 @@ class Sampler:
             views.resized(current_settings().candidate_side), rasterize_mode="antialiased"
         )
         widths = self._log_widths.exp().float()
+        means = self.few.means.unbind(1)
+        sizes = torch.tensor([size[:2] for size in small.size_of_each()], **DOUBLES).prod(1)
 
-        def look(index: int) -> tuple[float, Tensor]:
-            view = small[index]
-            pixels = pixels_of(self.few, view)
-            covered = float(pixels.double().sum())
-            distances = (self.few.means - eyes[index].float()).norm(dim=1).clamp_min(1e-3)
-            blur = 1.0  # radian, for an empty view
-            if covered > 0:
-                blur = max(float((pixels * widths / distances).double().sum()) / covered, 1e-9)
+        def look(these: slice) -> tuple[Tensor, Tensor]:
+            pixels = pixels_of_each(self.few, small[these])
+            squares = (
+                (mean - eye[:, None]).square_()
+                for mean, eye in zip(means, eyes[these].float().unbind(1), strict=True)
+            )
+            distances = sum(squares, pixels.new_zeros(())).sqrt_().clamp_min_(1e-3)
+            covered = pixels.sum(1, dtype=torch.float64)
+            blur = (distances.reciprocal_().mul_(pixels) @ widths) / covered
+            # 1 radian for an empty view
+            blur = blur.clamp_min(1e-9).where(covered > 0, torch.ones_like(covered))
             shown = pixels > 0.02  # sum of blending weights
-            share = (float(shown.sum()) + 1) / len(pixels)
-            empty = max(0.0, 1 - covered / (view.width * view.height))
-            return math.log(share) - math.log(empty + 0.01) - 2 * math.log(blur), shown
+            share = (shown.sum(1).double() + 1) / shown.shape[1]
+            empty = (1 - covered / sizes[these]).clamp_min(0.0)
+            return share.log() - (empty + 0.01).log() - 2 * blur.log(), shown
 
-        likelihoods, shown = zip(
-            *parallel_map(look, range(len(small)), self.few.device), strict=True
+        found = parallel_map(
+            look, pieces(len(small), self.few.device, VIEWS_AT_ONCE), self.few.device
         )
+        likelihoods, shown = (torch.cat(parts) for parts in zip(*found, strict=True))
         traces = self._traces
         evidence = (
             traces.evidence(eyes).double() if traces.has_sh else torch.zeros(len(eyes), **DOUBLES)
         )
         pitch = torch.rad2deg(torch.asin((viewmats[:, 2, :3] @ self.up.direction).clamp(-1, 1)))
         usual = -0.5 * ((pitch + 15) / 25).square()
-        return torch.tensor(likelihoods, **DOUBLES) + 0.75 * evidence + usual, torch.stack(shown)
+        return likelihoods + 0.75 * evidence + usual, shown
 
     def completing(self, likelihoods: Tensor, shown: Tensor, count: int) -> list[int]:
         """Indices of at most ``count`` views, from the result of :meth:`judged`. Greedy: the next

@@ -14,17 +14,48 @@ far away.
 
 from __future__ import annotations
 
+import ctypes
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from pointsplat_ns.rendering.spherical_harmonics import sh_basis
 from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.system.kernels import (
+    DOUBLE_POINTER,
+    FLOAT_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.pieces import in_pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.view_sampling.settings import current_settings
+
+
+class PhotoEvidenceStruct(Struct):
+    """``PhotoEvidence`` of ``photo_evidence.cpp``, which documents its members."""
+
+    members = {
+        "places": DOUBLE_POINTER,
+        "count": ctypes.c_int64,
+        "means": DOUBLE_POINTER,
+        "sh": FLOAT_POINTER,
+        "blocks": ctypes.c_int64,
+        "degree": ctypes.c_int64,
+        "factor": ctypes.c_double,
+        "evidence": FLOAT_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+photo_evidence_kernel = Function("pointsplat_photo_evidence", PhotoEvidenceStruct, INT64_POINTER)
 
 MIN_SH = 1e-4
 """Length of an SH coefficient vector, root of the sum of squares, that counts as untrained."""
@@ -148,16 +179,53 @@ class PhotoTraces:
         """Evidence (P,) float32 for places (P, 3): the mean of the :func:`explained_energy`;
         without SH, the correlation of the logarithms of size and distance."""
         if self.has_sh:
-            return torch.stack(
-                [explained_energy(self._means - place, self._sh).mean() for place in places]
+            return mean_explained(self._means, self._sh, places)
+        tiny = torch.finfo(torch.float64).tiny
+        found = [
+            correlations(
+                (self._means - some[:, None]).norm(dim=2).clamp_min(tiny).log(), self._sizes
             )
-        distances = (
-            (self._means - place).norm(dim=1).clamp_min(torch.finfo(torch.float64).tiny)
-            for place in places
-        )
-        return torch.stack(
-            [correlation(distance.log(), self._sizes) for distance in distances]
-        ).float()
+            for some in places.split(64)
+        ]
+        return torch.cat(found).float() if found else torch.zeros(0, **FLOATS)
+
+
+def mean_explained(
+    means: Tensor, sh: Tensor, places: Tensor, compiled: bool | None = None
+) -> Tensor:
+    """Mean of the :func:`explained_energy` of n Gaussians for each place, (P,) float32.
+
+    Args:
+        means: (n, 3) float64; n at least 1.
+        sh: (n, K, 3) float32, as there.
+        places: (P, 3) float64.
+        compiled: False uses torch; True warns if the kernels are missing.
+    """
+    count, width = sh.shape[:2]
+    if not KERNELS.usable_for(compiled, sh):
+        found = [explained_energy(means - place, sh).mean() for place in places]
+        return torch.stack(found) if found else torch.zeros(0, **FLOATS)
+    evidence = torch.empty(len(places), **FLOATS)
+    blocks = -(-count // 8)
+    lanes = [
+        F.pad(values.flatten(1), (0, 0, 0, 8 * blocks - count))
+        .view(blocks, 8, -1)
+        .transpose(1, 2)
+        .contiguous()
+        for values in (means, sh)
+    ]
+    task = PhotoEvidenceStruct(
+        places=places.contiguous(),
+        count=len(places),
+        means=lanes[0],
+        sh=lanes[1],
+        blocks=blocks,
+        degree=math.isqrt(width + 1) - 1,
+        factor=4 * math.pi / count,
+        evidence=evidence,
+    )
+    on_threads(len(places) > 1, photo_evidence_kernel, task)
+    return evidence
 
 
 def unit_sh(sh: Tensor) -> Tensor:
@@ -174,9 +242,16 @@ def log_widths(scales: Tensor) -> Tensor:
     return scales.double().clamp(-100.0, 100.0).sort(dim=1).values[:, 1:].mean(1)
 
 
-def correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Pearson's correlation coefficient of a (n,) and b (n,), a scalar; 0 if either is constant."""
-    return torch.corrcoef(torch.stack([a, b]))[0, 1].nan_to_num(0.0)
+def correlations(several: Tensor, one: Tensor) -> Tensor:
+    """Pearson's correlation coefficients (m,) of rows (m, n) with one (n,), float64; 0 if either is
+    constant."""
+    centred = []
+    for values in (several, one[None]):
+        apart = values - values.mean(1, keepdim=True)
+        tiny = torch.finfo(apart.dtype).tiny
+        apart = apart / apart.abs().amax(1, keepdim=True).clamp_min(tiny)
+        centred.append(apart / apart.norm(dim=1, keepdim=True))
+    return (centred[0] @ centred[1][0]).nan_to_num(0.0).clamp(-1.0, 1.0)
 
 
 def explained_energy(offsets: Tensor, sh: Tensor) -> Tensor:
@@ -194,7 +269,5 @@ def explained_energy(offsets: Tensor, sh: Tensor) -> Tensor:
         offsets / offsets.norm(dim=1, keepdim=True).clamp_min(torch.finfo(offsets.dtype).tiny)
     ).float()
     basis = sh_basis(directions, math.isqrt(sh.shape[1] + 1) - 1)[:, 1:]
-    along = (sh * basis[:, :, None]).sum(1).square().sum(1) / basis.square().sum(1).clamp_min(
-        MIN_SH
-    )
-    return along * sh.shape[1]
+    # the squares of all K basis functions have the sum K / (4 pi) in every direction (Unsöld)
+    return (sh * basis[:, :, None]).sum(1).square().sum(1) * (4 * math.pi)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import AXES, axis_along, direction_of, rotation_matrices
-from pointsplat_ns.rendering import pixels_of
+from pointsplat_ns.rendering import pixels_of_each
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.files import logger
 from pointsplat_ns.system.tensors import DOUBLES
@@ -85,6 +85,14 @@ class Surface:
     normals: Tensor  # [M, 3] float64, along the Gaussian's shortest axis, of either sign
     flatness: Tensor  # [M] float64 in [0, 1]: 1 minus the ratio of the shortest axis to the next
 
+    @functools.cached_property
+    def content(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Points (n, 3), normals (n, 3) and flatness (n,) of the first 4,096 points that belong to
+        the content; of the others if none does."""
+        near = self.points.norm(dim=1) < CONTENT_RADIUS
+        near = (near if bool(near.any()) else ~near).nonzero()[:4096, 0]
+        return self.points[near], self.normals[near], self.flatness[near]
+
     @staticmethod
     def of(scene: Gaussians) -> Surface:
         """The surface of a scene with visible content. Gaussians are sampled by the square root of
@@ -120,7 +128,11 @@ def upright(few: Gaussians, surface: Surface, traced: bool) -> Up:
     It is the end of :func:`upright_axis` from which more is visible. If the difference is small, z
     is up, or -y, as in scenes in the frame of their first camera.
     """
-    axis = upright_axis(surface, traced)
+    return _upper_end(upright_axis(surface, traced), few, surface)
+
+
+def _upper_end(axis: Tensor, few: Gaussians, surface: Surface) -> Up:
+    """The end of an axis that :func:`upright` takes."""
     from_above = _seen_from_above(few, surface, axis)
     sure = abs(from_above) >= current_settings().min_seen_from_above
     y = float(axis[1])
@@ -135,7 +147,7 @@ def _seen_from_above(few: Gaussians, surface: Surface, up: Tensor) -> float:
     def seen(up: Tensor) -> int:
         """Maximum number of Gaussians that a camera around the content shows."""
         views = whole_views(surface.points, up, around(6), 30.0, 128, 80)
-        return max(int((pixels_of(few, view) > 0.1).sum()) for view in views)
+        return int((pixels_of_each(few, views) > 0.1).sum(1).max())
 
     return math.log((seen(up) + 1) / (seen(-up) + 1))
 
@@ -153,14 +165,14 @@ def checked_up(declared: Up, few: Gaussians, surface: Surface, traced: bool) -> 
     if _seen_from_above(few, surface, up) < -settings.min_seen_from_below:
         other = Up(-up)
     elif axis_along(up) is not None:
-        found = upright(few, surface, traced)
-        rightness = _uprightness(surface, torch.stack([up, found.direction]))
+        axis = upright_axis(surface, traced)
+        rightness = _uprightness(surface, torch.stack([up, axis]))
         if (
             float(rightness[1]) > settings.min_other_uprightness
             and float(rightness[0] / rightness[1]) < settings.max_declared_uprightness
-            and abs(float(up @ found.direction)) < math.cos(math.radians(45))
+            and abs(float(up @ axis)) < math.cos(math.radians(45))
         ):
-            other = Up(found.direction)
+            other = Up(_upper_end(axis, few, surface).direction)
     if other is None:
         return declared
     _warn_of_contradiction(str(declared), str(other), axis_along(other.direction) or "")
@@ -210,13 +222,10 @@ def _uprightness(surface: Surface, axes: Tensor) -> Tensor:
     """Evidence (D,) for vertical axes (D, 3): the shares of level and of vertical surfaces, minus
     their mean of 0.193 over random directions, plus the largest share of points in one thin level
     slab."""
-    near = surface.points.norm(dim=1) < CONTENT_RADIUS
-    near = (near if bool(near.any()) else ~near).nonzero()[:4096, 0]
-    points = surface.points[near]
-    flatness = surface.flatness[near]
+    points, normals, flatness = surface.content
     weights = flatness / flatness.sum().clamp_min(1e-300)
     # [D, n] 90 where level
-    tilt = torch.rad2deg(torch.asin((axes @ surface.normals[near].T).abs().clamp_max(1)))
+    tilt = torch.rad2deg(torch.asin((axes @ normals.T).abs().clamp_max(1)))
     level, vertical = ((-0.5 * (angle / 8.0).square()).exp() for angle in (90 - tilt, tilt))
     slab = ((axes @ points.T + CONTENT_RADIUS) / 0.1).long().clamp(0, 119)
     counts = torch.zeros(len(axes), 120, **DOUBLES)

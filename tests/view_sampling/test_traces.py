@@ -12,7 +12,14 @@ from pointsplat_ns.pipeline.view_provider import Origin, ViewOrigin, ViewProvide
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.view_sampling.sampler import sample_views
 from pointsplat_ns.view_sampling.settings import DEFAULT_SETTINGS
-from pointsplat_ns.view_sampling.traces import PhotoTraces, correlation, trace_factors
+from pointsplat_ns.view_sampling.traces import (
+    PhotoTraces,
+    correlations,
+    explained_energy,
+    mean_explained,
+    trace_factors,
+    unit_sh,
+)
 
 
 def test_places_of_photos_are_found():
@@ -33,9 +40,28 @@ def test_correlation_is_that_of_float64_at_any_size(size):
     a, b = torch.randn(2, 500, generator=generator, dtype=torch.float64)
     b = b + a
     expected = float(torch.corrcoef(torch.stack([a, b]))[0, 1])
-    assert float(correlation(size * a, b)) == pytest.approx(expected, abs=1e-12)
-    assert float(correlation(torch.full_like(a, size), b)) == pytest.approx(0, abs=1e-6)
-    assert float(correlation(torch.zeros_like(a), b)) == 0
+    rows = torch.stack([size * a, torch.full_like(a, size), torch.zeros_like(a)])
+    found, equal, zero = correlations(rows, b).tolist()
+    assert found == pytest.approx(expected, abs=1e-12)
+    assert equal == pytest.approx(0, abs=1e-6) and zero == 0
+    assert correlations(rows, torch.ones_like(b)).tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 8, 21])  # less than, exactly and more than a vector of 8
+def test_evidence_of_kernels_is_that_of_torch(degree, count):
+    scene = ball(count, degree)
+    sh = unit_sh(scene.features_rest)
+    generator = torch.Generator().manual_seed(degree)
+    places = 3 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    ours, torchs = (mean_explained(scene.means.double(), sh, places, to) for to in (None, False))
+    torch.testing.assert_close(ours, torchs, rtol=1e-5, atol=1e-6)  # float32
+
+
+def test_random_sh_are_explained_once_on_average():
+    scene = ball(4000, 3)
+    found = explained_energy(scene.means.double(), unit_sh(scene.features_rest))
+    assert float(found.mean()) == pytest.approx(1, abs=0.1)  # of random directions
 
 
 @pytest.mark.parametrize(
