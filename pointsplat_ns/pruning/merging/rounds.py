@@ -276,12 +276,10 @@ def first_step(
         give_back_freed_memory()  # of finished threads
         found = None
         weights = torch.ones_like(participants.members, dtype=torch.float32)
-        blurs = None
         if len(participants) > last:
-            found, (weights, blurs) = views_and_weights(
+            found, weights = views_and_weights(
                 participants, views, settings, lambda share: report(0.5 * share)
             )
-        participants = replace(participants, blurs=blurs)
         return _with_reference(
             Step(participants, found, initial_state(participants, weights)), settings
         )

@@ -55,10 +55,6 @@ class MergeSettings:
     """Lower bound of a visibility weight, relative to a clearly visible Gaussian. Above 0, because
     real cameras may stand elsewhere. 1e-2 loses 2 dB in a capture with its poses (fox, 10 %)."""
 
-    blur: float = 1.0
-    """Share of the rasterizer's blur by which Gaussians are widened while they are merged; 0 turns
-    this off. With 2 in place of 1, a bouquet, a bathroom and flowers lose 0.2 dB at 30 %."""
-
     neighbours: int = 6
     """Number of nearest centres considered as partners. 8 are 0.1 dB worse, 12 0.4."""
 
