@@ -250,11 +250,11 @@ class Sampler:
             views.resized(current_settings().candidate_side), rasterize_mode="antialiased"
         )
         widths = self._log_widths.exp().float()
-        means = self.few.means.unbind(1)
+        means = self.few.means.float().unbind(1)
         sizes = torch.tensor([size[:2] for size in small.size_of_each()], **DOUBLES).prod(1)
 
         def look(these: slice) -> tuple[Tensor, Tensor]:
-            pixels = pixels_of_each(self.few, small[these])
+            pixels = pixels_of_each(self.few, small[these]).float()
             squares = (
                 (mean - eye[:, None]).square_()
                 for mean, eye in zip(means, eyes[these].float().unbind(1), strict=True)
