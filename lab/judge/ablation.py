@@ -48,7 +48,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "sampled_views_24": dict(sampled_views=24),
     "other_views": dict(view_seed=2),
     "visibility_views_16": dict(visibility_views=16),
-    "drawn_at_once": dict(drawn_in_turn=1),
     "drawn_100k": dict(max_count_drawn=100_000),
     "equal_weights": dict(min_visibility=1.0),
     "min_visibility_1e-2": dict(min_visibility=1e-2),

@@ -37,14 +37,6 @@ class MergeSettings:
     """Maximum number of views for counting covered pixels. 48 gain 0.2 to 0.7 dB over 16 in a
     lounge."""
 
-    drawn_in_turn: int = 2
-    """Number of parts of the Gaussians that views draw in turn, enlarged to cover as much as all.
-    1 takes 0.3 of 3 CPU seconds longer in a merge of 101,000 to 10 %, and gains nothing: -0.1 dB
-    in a bathroom and 0.0 in a jug over three seeds. With 3, a bouquet loses 0.1 dB."""
-
-    min_views_in_turn: int = 16
-    """Minimum number of views that draw each part; with fewer, all draw all."""
-
     max_count_drawn: int = 250_000
     """Maximum number of Gaussians drawn to count covered pixels; in larger scenes, every second
     (third, ...) is drawn, enlarged. In a lounge of 445,000, half or a quarter is as good as all

@@ -21,18 +21,14 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import Participants
-from pointsplat_ns.rendering import pixels_of_each
+from pointsplat_ns.rendering import pixels_of
+from pointsplat_ns.rendering.comparison.each_view import each_view
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
-from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import numbers
-from pointsplat_ns.system.threads import parallel_map
 from pointsplat_ns.view_sampling.content import every_nth, in_units, views_in_units
 from pointsplat_ns.view_sampling.sampler import Sampler
 from pointsplat_ns.view_sampling.traces import trace_factors
-
-VIEWS_AT_ONCE = 4
-"""Number of views whose covered pixels are in memory at a time, per thread."""
 
 
 def views_and_weights(
@@ -122,35 +118,22 @@ def covered_per_area(
         scene: N Gaussians.
         rows: (n,) indices, n at least 1.
         views: of the scene, in its own unit.
-        settings: ``visibility_views``, ``drawn_in_turn``, ``min_views_in_turn`` and
-            ``min_visibility``.
+        settings: ``visibility_views`` and ``min_visibility``.
         report: called with the share of the views done.
 
     Returns:
         (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows
         enough Gaussians.
     """
+    covered = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     small = views.spread(settings.visibility_views).resized(112)
     small = replace(small, rasterize_mode="antialiased")
-    turns = min(settings.drawn_in_turn, max(1, len(small) // settings.min_views_in_turn))
-    covered = torch.zeros(len(rows), dtype=torch.float64, device=scene.device)
-    done = 0
-    for turn in range(turns):
-        drawn = every_nth(scene, rows[turn:], turns)
-        in_turn = small[turn::turns]
-
-        def look(these: slice, drawn: Gaussians = drawn, in_turn: Views = in_turn) -> Tensor:
-            return pixels_of_each(drawn, in_turn[these])
-
-        some = pieces(len(in_turn), scene.device, VIEWS_AT_ONCE)
-        for pixels in parallel_map(look, some, scene.device):
-            for of_view in pixels:
-                covered[turn::turns] += of_view
-            done += len(pixels)
-            report(done / len(small))
+    for done, pixels in enumerate(each_view(scene, small, pixels_of)):
+        covered += pixels
+        report((done + 1) / len(small))
     stds = scene.stds[rows].double().sort(dim=1).values
     area = (scene.alphas[rows].double() * stds[:, 1] * stds[:, 2]).nan_to_num(0.0, 0.0, 0.0)
-    ratios = covered / area.clamp_min(torch.finfo(torch.float64).tiny)
+    ratios = covered[rows] / area.clamp_min(torch.finfo(torch.float64).tiny)
     well_seen = ratios.sort().values[int(0.9 * (len(ratios) - 1))]
     if not 0 < float(well_seen) < math.inf:
         return torch.ones_like(ratios, dtype=torch.float32)

@@ -11,7 +11,6 @@ from pointsplat_ns.pruning.merging import MERGING, visibility
 from pointsplat_ns.pruning.merging.groups import best_size_change, top_of_parabola
 from pointsplat_ns.pruning.merging.state import Participants
 from pointsplat_ns.pruning.merging.visibility import covered_per_area, views_and_weights
-from pointsplat_ns.rendering import pixels_of_each
 from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
@@ -97,31 +96,6 @@ def test_weights_are_bounded_whatever_the_scene(dtype, case):
     )
     if case in ("transparent", "no view"):  # nothing is known
         assert found.tolist() == [1.0] * 400
-
-
-def test_of_many_views_each_draws_a_part_and_weights_are_about_the_same(monkeypatch):
-    scene = Gaussians.cat([aside(wall(0), -1.2), aside(wall(4), 1.2), wall(9)])
-    views = of_origin(*((0.05 * step - 0.8, 0, -4) for step in range(32)))
-    drawn = []
-
-    def recorded(scene: Gaussians, views: Views) -> torch.Tensor:
-        drawn.append((len(scene), len(views)))
-        return pixels_of_each(scene, views)
-
-    monkeypatch.setattr(visibility, "pixels_of_each", recorded)
-    parts = weights_of(scene, views)
-    assert {count for count, _ in drawn} == {len(scene) // 2}
-    assert sum(some for _, some in drawn) == 32
-    drawn.clear()
-    few = weights_of(scene, views[:31])  # too few for each part
-    assert {count for count, _ in drawn} == {len(scene)}
-    whole = covered_per_area(
-        scene, torch.arange(len(scene)), views, replace(MERGING, drawn_in_turn=1)
-    )
-    # every second Gaussian, drawn twice as large, covers other pixels at borders
-    for found, within in ((parts, 0.2), (few, 0.05)):
-        apart = (found.log() - whole.log()).abs()[whole > 0.05]
-        assert len(apart) > 1000 and float(apart.median()) < within
 
 
 def test_traces_count_where_sh_tell_of_photos_and_fog_has_no_views(monkeypatch):
