@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import re
 import threading
 import time
@@ -157,25 +156,15 @@ class Viewers:
 def viewers(files: Path) -> Iterator[Viewers]:
     """A browser of its own for files in a folder, closed at the end. Raises Missing if Chromium or
     the packages are missing."""
-    from selenium import webdriver
-
     roots = {"modules": packages.modules(), "pages": PAGES, "files": files}
-    found = packages.chromium()
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, roots))
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    options = webdriver.ChromeOptions()
-    options.binary_location = found.program
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    for argument in ARGUMENTS:
-        options.add_argument(argument)
-    service = webdriver.ChromeService(found.driver, env={**os.environ, **found.environment})
-    driver = webdriver.Chrome(options=options, service=service)
     try:
-        size = {"width": SIZE, "height": SIZE, "deviceScaleFactor": 1, "mobile": False}
-        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        yield Viewers(driver, f"http://127.0.0.1:{server.server_port}")
+        with packages.browser(ARGUMENTS) as driver:
+            size = {"width": SIZE, "height": SIZE, "deviceScaleFactor": 1, "mobile": False}
+            driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+            yield Viewers(driver, f"http://127.0.0.1:{server.server_port}")
     finally:
-        driver.quit()
         server.shutdown()
         server.server_close()

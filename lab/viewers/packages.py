@@ -9,10 +9,11 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system.files import one_line
@@ -137,6 +138,26 @@ def chromium() -> Chromium:
     )
     environment = {"LD_LIBRARY_PATH": libraries, "FONTCONFIG_FILE": str(folder / "fonts.conf")}
     return Chromium(str(folder / "chromium"), binary_path, environment)
+
+
+@contextmanager
+def browser(arguments: Iterable[str]) -> Iterator[Any]:
+    """A browser of its own with these arguments, driven by selenium and closed at the end. Raises
+    Missing if there is no Chromium."""
+    from selenium import webdriver
+
+    found = chromium()
+    options = webdriver.ChromeOptions()
+    options.binary_location = found.program
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    for argument in arguments:
+        options.add_argument(argument)
+    service = webdriver.ChromeService(found.driver, env={**os.environ, **found.environment})
+    driver = webdriver.Chrome(options=options, service=service)
+    try:
+        yield driver
+    finally:
+        driver.quit()
 
 
 def _unpacked(packed: Path) -> Path:

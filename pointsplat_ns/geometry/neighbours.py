@@ -14,6 +14,7 @@ from pointsplat_ns.system.kernels import (
     INT32_POINTER,
     INT64_POINTER,
     KERNELS,
+    LANES,
     SEVERAL,
     Function,
     Struct,
@@ -95,16 +96,14 @@ class _KernelTree:
     """The twin of :class:`~pointsplat_ns.geometry.box_tree.BoxTree` with compiled kernels, for at
     most :data:`most_nearest_kernel` neighbours of points (N, 3) float64."""
 
-    LEAF = 8  # points
-
     def __init__(self, points: Tensor):
         n = len(points)
-        leaves = -(-n // self.LEAF)
+        leaves = -(-n // LANES)
         self._tree = PointTreeStruct(
             points=points.contiguous(),
             count=n,
             order=torch.empty(n, dtype=torch.int32, device="cpu"),
-            leaves=torch.empty(leaves, 3, self.LEAF, **DOUBLES),
+            leaves=torch.empty(leaves, 3, LANES, **DOUBLES),
             boxes=torch.empty(2 * leaves - 1, 6, **DOUBLES),
         )
         build_tree_kernel(self._tree)

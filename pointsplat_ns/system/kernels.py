@@ -134,6 +134,9 @@ class Function:
         return self._loaded(*arguments)
 
 
+LANES = 8
+"""Numbers that the kernels compute at a time: ``LANES`` of ``lanes.h``."""
+
 SEVERAL = 4000
 """Gaussians, or pairs of Gaussian and tile, above which several threads are faster than one."""
 

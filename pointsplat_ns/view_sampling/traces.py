@@ -29,6 +29,7 @@ from pointsplat_ns.system.kernels import (
     FLOAT_POINTER,
     INT64_POINTER,
     KERNELS,
+    LANES,
     Function,
     Struct,
     c_fields,
@@ -206,19 +207,19 @@ def mean_explained(
         found = [explained_energy(means - place, sh).mean() for place in places]
         return torch.stack(found) if found else torch.zeros(0, **FLOATS)
     evidence = torch.empty(len(places), **FLOATS)
-    blocks = -(-count // 8)
-    lanes = [
-        F.pad(values.flatten(1), (0, 0, 0, 8 * blocks - count))
-        .view(blocks, 8, -1)
+    blocks = -(-count // LANES)
+    means_in_lanes, sh_in_lanes = (
+        F.pad(values.flatten(1), (0, 0, 0, LANES * blocks - count))
+        .view(blocks, LANES, -1)
         .transpose(1, 2)
         .contiguous()
         for values in (means, sh)
-    ]
+    )
     task = PhotoEvidenceStruct(
         places=places.contiguous(),
         count=len(places),
-        means=lanes[0],
-        sh=lanes[1],
+        means=means_in_lanes,
+        sh=sh_in_lanes,
         blocks=blocks,
         degree=math.isqrt(width + 1) - 1,
         factor=4 * math.pi / count,

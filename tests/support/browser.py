@@ -17,14 +17,11 @@ SECONDS = 90
 def chromium() -> Iterator:
     """A browser of its own, closed at the end. The test is skipped where Chromium or its driver is
     missing."""
-    selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     try:
-        found = packages.chromium()
+        packages.chromium()
     except packages.Missing as reason:
         pytest.skip(f"no page can be opened: {reason}")
-    options = selenium.ChromeOptions()
-    options.binary_location = found.program
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     arguments = [
         "--headless=new",
         "--disable-gpu",
@@ -35,14 +32,8 @@ def chromium() -> Iterator:
     arguments += (
         ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
     )  # Chromium has none for root
-    for argument in arguments:
-        options.add_argument(argument)
-    service = selenium.ChromeService(found.driver, env={**os.environ, **found.environment})
-    browser = selenium.Chrome(options=options, service=service)
-    try:
+    with packages.browser(arguments) as browser:
         yield browser
-    finally:
-        browser.quit()
 
 
 @contextmanager
