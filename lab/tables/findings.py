@@ -64,7 +64,7 @@ class Claim:
             return None
         point = cell["point"]
         if self.measure in PUBLISHED_METRICS:
-            return (point["against_photos"] or point["against_dense"])[self.measure]
+            return (point["against_photos"] or point["against_dense"]).get(self.measure)
         return point.get(self.measure)
 
     def of_paper(self) -> dict[str, float]:
