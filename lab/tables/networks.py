@@ -138,7 +138,7 @@ def main(
             needs |= {"load-dir": folder / "nerfstudio_models"}
         except SceneError:  # no checkpoint yet
             shutil.rmtree(folder, ignore_errors=True)
-        needs |= {"machine.seed": job.seed} | ({} if seconds is None else {"seconds": seconds})
+        needs |= {} if seconds is None else {"seconds": seconds}
         print(f"{number} of {len(own)}: {job.name}", flush=True)
         command = train_refiner_command(
             scenes, output, job.name, left, "run", held_out, needs, chosen.method

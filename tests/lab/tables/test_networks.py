@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
 import pointsplat_ns as ps
 from lab.tables import figures, networks
@@ -23,9 +25,18 @@ NUMBER = {job.name: f"{number}/16" for number, job in enumerate(jobs(), 1)}
 """Shards of one network each."""
 
 
+def check_training(words: list[str]) -> None:
+    """Fail unless ``ns-train`` takes the arguments and its trainer their values."""
+    config = tyro.cli(
+        tyro.conf.FlagConversionOff[AnnotatedBaseConfigUnion], args=words[1:], prog=words[0]
+    )
+    config.check()
+
+
 def written(command: str, log: Path) -> None:
     """In place of a training: weights with the metadata of one, by the options of its command."""
     words = shlex.split(command)
+    check_training(words)
     given = {word[2:]: words[i + 1] for i, word in enumerate(words) if word.startswith("--")}
     model = {key.rpartition(".")[2]: value for key, value in given.items() if ".model." in key}
     switches = {name.replace("-", "_"): False for name in model if name.startswith("use-")}
