@@ -261,7 +261,6 @@ def weights_of_each(
         views=len(cameras),
         drawing=blending.TaskStruct(
             log2_alpha_min=math.log2(alpha_min),
-            alpha_min=alpha_min,
             alpha_max=ALPHA_MAX,
             transmittance_min=TRANSMITTANCE_MIN,
         ),

@@ -93,7 +93,7 @@ struct Some {
 inline Lane overlap_of_sum(Lane uu, Lane uv, Lane vv, Lane areas, Lane u, Lane v) {
     const Lane inverse = 1.0f / larger(uu * vv - uv * uv, ZERO + TINY);
     const Lane distance = larger(((vv * u - 2.0f * uv * v) * u + uu * v * v) * inverse, ZERO);
-    return exp2_of(distance * -0.72134752044f) * root(inverse) * areas;  // 0.5 log2 e
+    return exp2_of(larger(distance * -0.72134752044f, ZERO - 125.0f)) * root(inverse) * areas;  // 0.5 log2 e
 }
 
 }  // namespace

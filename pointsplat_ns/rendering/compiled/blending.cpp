@@ -78,8 +78,9 @@ struct Chunk {
 
     // Alphas of a row of pixels, 0 where the Gaussian is not drawn for being faint.
     Row alpha(int k, int row, Row w_row, const Task& task) const {
-        const Row value = smaller(exp2_of(base[k][row] - half_a[k] * (w_row * w_row)), ZERO + task.alpha_max);
-        return value > task.alpha_min ? value : ZERO;
+        const Row log2_alpha = base[k][row] - half_a[k] * (w_row * w_row);
+        const Row value = smaller(exp2_of(log2_alpha), ZERO + task.alpha_max);
+        return log2_alpha > task.log2_alpha_min ? value : ZERO;
     }
 };
 

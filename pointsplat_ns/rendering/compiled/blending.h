@@ -13,7 +13,7 @@ struct Task {
     const int64_t* offsets;    // [tiles + 1] where each tile's Gaussians start
     const int64_t* chunks;     // [tiles + 1] where each tile's chunks start
     int64_t tiles, columns, top, width, height, channels;
-    float log2_alpha_min, alpha_min, alpha_max, clamped_from, transmittance_min;
+    float log2_alpha_min, alpha_max, clamped_from, transmittance_min;
     float* image;        // [tiles, channels, PIXELS]
     float* final_;       // [tiles, PIXELS] transmittance left
     float* before;       // [chunks, PIXELS] transmittance in front of each chunk; null where it is not wanted
