@@ -21,14 +21,16 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import Participants
-from pointsplat_ns.rendering import pixels_of
-from pointsplat_ns.rendering.comparison.each_view import each_view
+from pointsplat_ns.rendering import pixels_of_each
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
 from pointsplat_ns.system.tensors import numbers
 from pointsplat_ns.view_sampling.content import every_nth, in_units, views_in_units
 from pointsplat_ns.view_sampling.sampler import Sampler
 from pointsplat_ns.view_sampling.traces import trace_factors
+
+COUNT_AT_ONCE = 2_000_000
+"""Maximum number of Gaussians, summed over the views that are drawn at once, for memory."""
 
 
 def views_and_weights(
@@ -128,9 +130,11 @@ def covered_per_area(
     covered = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     small = views.spread(settings.visibility_views).resized(112)
     small = replace(small, rasterize_mode="antialiased")
-    for done, pixels in enumerate(each_view(scene, small, pixels_of)):
-        covered += pixels
-        report((done + 1) / len(small))
+    at_once = max(2, COUNT_AT_ONCE // len(scene))
+    for first in range(0, len(small), at_once):
+        for pixels in pixels_of_each(scene, small[first : first + at_once]):
+            covered += pixels
+        report(min(first + at_once, len(small)) / len(small))
     stds = scene.stds[rows].double().sort(dim=1).values
     area = (scene.alphas[rows].double() * stds[:, 1] * stds[:, 2]).nan_to_num(0.0, 0.0, 0.0)
     ratios = covered[rows] / area.clamp_min(torch.finfo(torch.float64).tiny)
