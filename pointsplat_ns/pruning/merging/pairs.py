@@ -18,6 +18,7 @@ opacity, the area grows instead.
 
 from __future__ import annotations
 
+import ctypes
 import math
 from typing import NamedTuple
 
@@ -36,16 +37,85 @@ from pointsplat_ns.pruning.merging.covariance import (
 )
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State
+from pointsplat_ns.system.kernels import (
+    FLOAT_POINTER,
+    INT32_POINTER,
+    INT64_POINTER,
+    KERNELS,
+    SEVERAL,
+    Function,
+    Struct,
+    c_fields,
+    on_threads,
+)
 from pointsplat_ns.system.pieces import pieces
-from pointsplat_ns.system.tensors import numbers
+from pointsplat_ns.system.tensors import INDICES, numbers
 from pointsplat_ns.system.threads import parallel_for, parallel_map
+
+
+class MatchingStruct(Struct):
+    """``Matching`` of ``pairs.cpp``, which documents its members."""
+
+    members = {
+        "near": INT32_POINTER,
+        "costs": FLOAT_POINTER,
+        "count": ctypes.c_int64,
+        "neighbours": ctypes.c_int64,
+        "keys": INT64_POINTER,
+        "least": INT64_POINTER,
+        "partner": INT32_POINTER,
+        "best": INT64_POINTER,
+        "taken": INT32_POINTER,
+        "first": INT64_POINTER,
+        "second": INT64_POINTER,
+        "found": INT64_POINTER,
+        "pairs": INT64_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+class ReplacingStruct(Struct):
+    """``Replacing`` of ``pairs.cpp``, which documents its members."""
+
+    members = {
+        "max_opacity": ctypes.c_double,
+        "growth_exponent": ctypes.c_double,
+        "first": INT64_POINTER,
+        "second": INT64_POINTER,
+        "place": INT64_POINTER,
+        "count": ctypes.c_int64,
+        "axes": ctypes.c_int64,
+        "means": FLOAT_POINTER,
+        "cov": FLOAT_POINTER,
+        "alphas": FLOAT_POINTER,
+        "colours": FLOAT_POINTER,
+        "weights": FLOAT_POINTER,
+        "counts": INT32_POINTER,
+        "means_after": FLOAT_POINTER,
+        "cov_after": FLOAT_POINTER,
+        "alphas_after": FLOAT_POINTER,
+        "colours_after": FLOAT_POINTER,
+        "weights_after": FLOAT_POINTER,
+        "counts_after": INT32_POINTER,
+        "shares": FLOAT_POINTER,
+    }
+    _fields_ = c_fields(members)
+
+
+pair_keys_kernel = Function("pointsplat_pair_keys", MatchingStruct, INT64_POINTER)
+least_keys_kernel = Function("pointsplat_least_keys", MatchingStruct, INT64_POINTER)
+take_pairs_kernel = Function("pointsplat_take_pairs", MatchingStruct)
+replace_pairs_kernel = Function("pointsplat_replace_pairs", ReplacingStruct, INT64_POINTER)
 
 NEVER = torch.iinfo(torch.int64).max
 """Key of an invalid pair."""
 
 
 def cheapest_pairs(
-    near: Tensor, costs: Tensor, passes: int = MERGING.matching_passes
+    near: Tensor,
+    costs: Tensor,
+    passes: int = MERGING.matching_passes,
+    compiled: bool | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Disjoint pairs of neighbours, cheapest first.
 
@@ -57,11 +127,50 @@ def cheapest_pairs(
         costs: (n, k) float32, at least 0, of merging each with each neighbour. If two are
             neighbours of each other, the mean of their two costs counts.
         passes: number of passes.
+        compiled: False uses torch; True warns if the kernels are missing.
 
     Returns:
         First and second members, (E,) int64 each, and costs, (E,) float32; at least one pair if
         there is any neighbour.
     """
+    if near.dtype == torch.int32 and KERNELS.usable_for(compiled, costs):
+        found = _found_by_kernels(near, costs, passes)
+    else:
+        found = _found_by_torch(near, costs, passes)
+    first, second, key = found
+    # sorting integers takes a tenth of the time of floats
+    prices, order = (key >> 32).int().sort(stable=True)
+    return first[order], second[order], prices.view(torch.float32)
+
+
+def _found_by_kernels(near: Tensor, costs: Tensor, passes: int) -> list[Tensor]:
+    """Members of the pairs of :func:`cheapest_pairs` and their keys, (E,) int64 each, as found."""
+    n = len(near)
+    most = (torch.empty(n // 2, **INDICES) for _ in range(3))
+    found = dict(zip(("first", "second", "found"), most, strict=True))
+    number = torch.zeros(1, **INDICES)
+    task = MatchingStruct(
+        near=near.contiguous(),
+        costs=costs.contiguous(),
+        count=n,
+        neighbours=near.shape[1],
+        keys=torch.empty(near.shape, **INDICES),
+        least=torch.empty(n, **INDICES),
+        partner=torch.empty(n, dtype=torch.int32, device="cpu"),
+        best=torch.empty(n, **INDICES),
+        taken=torch.zeros(n, dtype=torch.int32, device="cpu"),
+        pairs=number,
+        **found,
+    )
+    on_threads(n >= SEVERAL, pair_keys_kernel, task)
+    for _ in range(passes):
+        on_threads(n >= SEVERAL, least_keys_kernel, task)
+        take_pairs_kernel(task)
+    return [values[: int(number)] for values in found.values()]
+
+
+def _found_by_torch(near: Tensor, costs: Tensor, passes: int) -> list[Tensor]:
+    """As :func:`_found_by_kernels`."""
     n = len(near)
     device = near.device
     taken = torch.zeros(n, dtype=torch.bool, device=device)
@@ -95,10 +204,7 @@ def cheapest_pairs(
             j = partner[mutual]
             found.append((i, j, least[mutual]))
             taken[i] = taken[j] = True
-    first, second, key = (torch.cat(parts) for parts in zip(*found, strict=True))
-    # sorting integers takes a tenth of the time of floats
-    prices, order = (key >> 32).int().sort(stable=True)
-    return first[order], second[order], prices.view(torch.float32)
+    return [torch.cat(parts) for parts in zip(*found, strict=True)]
 
 
 def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
@@ -135,7 +241,11 @@ class Round(NamedTuple):
 
 
 def replace_pairs(
-    state: State, first: Tensor, second: Tensor, settings: MergeSettings
+    state: State,
+    first: Tensor,
+    second: Tensor,
+    settings: MergeSettings,
+    compiled: bool | None = None,
 ) -> tuple[State, Round]:
     """Replace disjoint pairs; a replacement takes the place of the first member.
 
@@ -143,6 +253,7 @@ def replace_pairs(
         state: n Gaussians.
         first, second: (E,) each, indices of the members.
         settings: ``max_opacity`` and ``growth_exponent``.
+        compiled: False uses torch; True warns if the kernels are missing.
 
     Returns:
         The state of n - E Gaussians, and the origin of each.
@@ -158,6 +269,21 @@ def replace_pairs(
         )
     )
     shares = torch.ones_like(state.weights)
+    if KERNELS.usable_for(compiled, state.means, state.cov, state.alphas):
+        task = ReplacingStruct(
+            max_opacity=settings.max_opacity,
+            growth_exponent=settings.growth_exponent,
+            first=first.contiguous(),
+            second=second.contiguous(),
+            place=place,
+            count=len(first),
+            axes=state.colours.shape[1],
+            **{name: values.contiguous() for name, values in vars(state).items()},
+            **{f"{name}_after": values for name, values in vars(after).items()},
+            shares=shares,
+        )
+        on_threads(len(first) >= SEVERAL, replace_pairs_kernel, task)
+        return after, Round(place.int(), shares)
 
     def replace(part: slice) -> None:
         i = first[part]

@@ -97,6 +97,32 @@ def test_a_state_in_float32_becomes_what_one_in_float64_becomes(scene):
         )  # areas of needles, of which float32 loses the width, are the others
 
 
+@pytest.mark.parametrize("scene", [cloud(2000), extremes(2000, 1.0)], ids=["cloud", "extremes"])
+def test_kernels_replace_pairs_as_torch_does(scene):
+    state = state_of(scene)
+    pairs = torch.randperm(2000, generator=torch.Generator().manual_seed(0))[:1800].view(2, -1)
+    (one, ours), (other, theirs) = (
+        replace_pairs(state, *pairs, MERGING, compiled) for compiled in (None, False)
+    )
+    assert torch.equal(ours.place, theirs.place) and torch.equal(one.counts, other.counts)
+    # float64 inside, where the overlap of lines loses some digits; then float32
+    torch.testing.assert_close(ours.shares, theirs.shares, rtol=1e-6, atol=1e-7)
+    for name, values in vars(one).items():
+        torch.testing.assert_close(values, getattr(other, name), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [2, 50, 5000])
+def test_kernels_find_the_pairs_that_torch_finds(n):
+    generator = torch.Generator().manual_seed(n)
+    near = torch.randint(n, (n, 6), generator=generator, dtype=torch.int32)
+    costs = torch.randint(9, (n, 6), generator=generator).float()  # many are equal
+    costs[costs == 8] = math.inf
+    ours, theirs = (cheapest_pairs(near, costs, compiled=compiled) for compiled in (None, False))
+    assert len(ours[0]) > 0
+    for one, other in zip(ours, theirs, strict=True):
+        assert torch.equal(one, other)
+
+
 def by_definition(near: torch.Tensor, costs: torch.Tensor, passes: int) -> list[tuple[int, int]]:
     """The pairs of :func:`cheapest_pairs`, one at a time, where no two cost the same."""
     rows = near.tolist()
