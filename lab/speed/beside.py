@@ -12,11 +12,13 @@ Both programs take turns, so that a busy machine slows both alike.
 
 from __future__ import annotations
 
+import compileall
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+import pointsplat_ns
 from lab.common.printing import markdown, start
 from lab.common.results import Results, Row, grouped, write_page
 from lab.common.ways import count_of, programs_of
@@ -94,6 +96,8 @@ def main(
     if write is not None:
         write_page(write, page)
         return
+    # as pip does at installation; a clone with PYTHONDONTWRITEBYTECODE compiles at every start
+    compileall.compile_dir(Path(pointsplat_ns.__file__).parent, quiet=2)
     results = Results(json_path, {}, resume)
     for source in scenes:
         if not results.of(source.stem):
