@@ -72,6 +72,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no_sh_evidence": dict(min_sh_evidence=1e9),
     "no_min_opacity": dict(min_opacity=0.0),
     "places_evenly": dict(photo_share_exponent=0.0),
+    "likely_share_1": dict(likely_share_exponent=1.0),
     "candidates_4": dict(candidates_per_view=4),
     "half_gain_coverage_1": dict(half_gain_coverage=1.0),
 }

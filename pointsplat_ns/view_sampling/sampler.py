@@ -16,14 +16,19 @@ separate poses from candidates any better, but is needed for views from within w
 lack. Limiting the pitch of candidates to -50 to 10 degrees instead loses 0.2 dB on average over the
 six at 10 %, most if the estimated up direction is wrong.
 In a closed room, candidates beyond its walls are left out
-(:mod:`~pointsplat_ns.view_sampling.enclosure`). See ``docs/concepts/sampled_views.md``.
+(:mod:`~pointsplat_ns.view_sampling.enclosure`).
+
+Few candidates are likely in a room: most look at a wall from near by, or through one. So only half
+of the candidates are drawn without regard to likelihood. The others look around from where likely
+ones of the first half stand (population Monte Carlo: Cappé et al., 2004). See
+``docs/concepts/sampled_views.md``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -54,6 +59,37 @@ from pointsplat_ns.view_sampling.upright import Surface, Up, checked_up, known_u
 
 VIEWS_AT_ONCE = 16
 """Number of candidates that a thread judges at a time: their numbers fit into its cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """C views that may be taken, in units of the content."""
+
+    viewmats: Tensor  # [C, 4, 4] float64
+    likelihoods: Tensor  # [C] float64, logarithms up to a constant
+    shown: Tensor  # [C, n] bool, of the Gaussians Sampler.few
+    enclosure: Tensor  # [C] float64 in (0, 1]
+
+    @property
+    def eyes(self) -> Tensor:
+        """Positions (C, 3) of the cameras."""
+        return invert_rigid(self.viewmats)[:, :3, 3]
+
+    def within_walls(self) -> Tensor:
+        """Log-likelihoods (C,), of which those beyond the walls of a closed room are -infinity."""
+        outside = outside_of_a_room(
+            self.enclosure, self.likelihoods, current_settings().room_enclosure
+        )
+        return self.likelihoods.masked_fill(outside, -math.inf)
+
+    def joined(self, others: Candidates) -> Candidates:
+        """These candidates, followed by others."""
+        return Candidates(
+            viewmats=torch.cat([self.viewmats, others.viewmats]),
+            likelihoods=torch.cat([self.likelihoods, others.likelihoods]),
+            shown=torch.cat([self.shown, others.shown]),
+            enclosure=torch.cat([self.enclosure, others.enclosure]),
+        )
 
 
 @torch.no_grad()
@@ -223,23 +259,28 @@ class Sampler:
         if count < 1:
             raise DataError(f"cannot sample {count} views; expected at least 1")
         generator = torch.Generator().manual_seed(seed)
-        drawn = self._drawn(
-            max(current_settings().min_candidates, current_settings().candidates_per_view * count),
-            generator,
+        total = max(
+            current_settings().min_candidates, current_settings().candidates_per_view * count
         )
-        candidates = views_of(drawn, *self.resolution, UNITS)
-        likelihoods, shown = self.judged(candidates)
-        eyes = invert_rigid(candidates.viewmats.double())[:, :3, 3]
-        outside = outside_of_a_room(
-            enclosures(self._some_points, eyes), likelihoods, current_settings().room_enclosure
-        )
-        likelihoods = likelihoods.masked_fill(outside, -math.inf)
+        half = total // 2
+        candidates = self._candidates(self._drawn(total - half, generator))
+        if half:
+            others = self._from_likely(candidates, half, generator)
+            candidates = candidates.joined(self._candidates(others))
+        likelihoods = candidates.within_walls()
         taken = (
             likelihoods.topk(count).indices.tolist()
             if likeliest
-            else self.completing(likelihoods, shown, count)
+            else self.completing(likelihoods, candidates.shown, count)
         )
-        return in_scene_units(candidates[taken], *self.content)
+        views = views_of(candidates.viewmats[taken], *self.resolution, UNITS)
+        return in_scene_units(views, *self.content)
+
+    def _candidates(self, viewmats: Tensor) -> Candidates:
+        """The candidates of world-to-camera matrices (C, 4, 4)."""
+        likelihoods, shown = self.judged(views_of(viewmats, *self.resolution, UNITS))
+        eyes = invert_rigid(viewmats)[:, :3, 3]
+        return Candidates(viewmats, likelihoods, shown, enclosures(self._some_points, eyes))
 
     def judged(self, views: Views) -> tuple[Tensor, Tensor]:
         """Log-likelihoods (V,) of views in units of the content, up to a constant, float64, and a
@@ -296,7 +337,7 @@ class Sampler:
         return taken
 
     def _drawn(self, count: int, generator: torch.Generator) -> Tensor:
-        """Candidates (count, 4, 4): half of them at random distances from Gaussians, half at likely
+        """Cameras (count, 4, 4): half of them at random distances from Gaussians, half at likely
         photo places."""
         half = count // 2 if len(self._traces.places) else 0
         at_gaussians = self._at_gaussians(count - half, generator)
@@ -325,15 +366,30 @@ class Sampler:
 
     def _from_places(self, count: int, generator: torch.Generator) -> Tensor:
         """Cameras (count, 4, 4) that look at Gaussians from near photo places, drawn by share."""
-        up = self.up.direction
         traces = self._traces
         drawn = torch.multinomial(
             traces.shares.float(), count, replacement=True, generator=generator
         )
-        offsets = torch.randn(count, 3, generator=generator, **DOUBLES)
-        eyes = traces.places[drawn] + current_settings().photo_place_deviation * offsets
+        return self._around(traces.places[drawn], generator)
+
+    def _from_likely(
+        self, candidates: Candidates, count: int, generator: torch.Generator
+    ) -> Tensor:
+        """Cameras (count, 4, 4) that look at Gaussians from near candidates, drawn by a power of
+        their likelihood."""
+        exponent = current_settings().likely_share_exponent
+        shares = (exponent * candidates.within_walls()).softmax(dim=0)
+        drawn = torch.multinomial(shares, count, replacement=True, generator=generator)
+        return self._around(candidates.eyes[drawn], generator)
+
+    def _around(self, places: Tensor, generator: torch.Generator) -> Tensor:
+        """Cameras (C, 4, 4) near places (C, 3), above the floor, that look at random Gaussians."""
+        up = self.up.direction
+        offsets = torch.randn(len(places), 3, generator=generator, **DOUBLES)
+        eyes = places + current_settings().place_deviation * offsets
         eyes = eyes + (self._floor - eyes @ up).clamp_min(0)[:, None] * up
-        return look_at(eyes, self.few.means[self._some_targets(count, generator)].double(), up)
+        targets = self.few.means[self._some_targets(len(places), generator)]
+        return look_at(eyes, targets.double(), up)
 
     def _some_targets(self, count: int, generator: torch.Generator) -> Tensor:
         """Indices (count,) of random target Gaussians, with equal probabilities."""

@@ -116,8 +116,13 @@ class ViewSamplingSettings:
     apparent_sizes: tuple[float, float] = (0.0015, 0.0175)
     """Angles that the Gaussians around the target subtend, radians: 2 to 24 pixels of 1920."""
 
-    photo_place_deviation: float = 0.15
-    """Standard deviation of candidates from photo places along each axis, units."""
+    likely_share_exponent: float = 0.5
+    """Exponent of a candidate's likelihood in its share of the candidates of the second half. With
+    1, most views of a bathroom are from one of its corners."""
+
+    place_deviation: float = 0.15
+    """Standard deviation of candidates from photo places and from likely candidates along each
+    axis, units."""
 
 
 DEFAULT_SETTINGS = ViewSamplingSettings()
