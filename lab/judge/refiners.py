@@ -1,8 +1,8 @@
 """What refiners gain over the pruned scene, in views that were chosen by hand: several of one kind,
 such as seeds.
 
-    python -m lab.judge.refiners scenes/rock.ply --refiners dual=RUN1 dual=RUN2 concat=RUN3
-    concat=RUN4 \\
+    python -m lab.judge.refiners scenes/rock.ply --refiners pointsplat=RUN1 pointsplat=RUN2
+    paper-splatformer=RUN3 \\
         --by paper --keep 0.1 --json docs/record/encoders.json
 
 A refiner is a run of ``ns-train pointsplat``, a .safetensors file, or ``shipped``. Residuals are

@@ -23,7 +23,7 @@ import tyro
 
 from lab.common.printing import markdown, number, put_between, start
 from lab.common.results import Row
-from lab.judge import refiners
+from lab.judge import encoders
 from lab.judge.record import FOLDER, ROOT
 from lab.tables import sources
 from lab.tables.cells import Tables
@@ -99,23 +99,6 @@ The scenes:
   was drawn on a GPU, which `python -m lab.speed.cuda` times. Fill: Gaussians that a viewer draws on a pixel.
 - Measured on {machines}.
 """
-
-ENCODERS = """## Dual-branch against concatenating encoder, three seeds each
-
-`lab/judge/refiners.py` measured [encoders.json](encoders.json): the gain over the paper's selection in three unseen
-scenes (apt_kitchen_balcony, pc_playbot, rock), 960 pixels wide, and its standard deviation over seeds. Networks learned
-on fourteen scenes of 20,000 Gaussians:
-
-```bash
-ns-train pointsplat --data scenes --pipeline.datamanager.supervision dense --pipeline.datamanager.sampled-poses 24 \\
-    --pipeline.datamanager.seed 0 --pipeline.model.encoder dual --pipeline.model.size tiny --pipeline.model.by paper \\
-    --pipeline.model.keep 0.1 --pipeline.model.augment True --pipeline.model.pixel-loss rmse \\
-    --pipeline.model.lpips-weight 0.05 --rate-factor 10 --max-num-iterations 250
-```
-
-{table}
-"""
-
 
 SETTINGS = """## Cited or unknown
 
@@ -327,8 +310,7 @@ def page(all_tables: Sequence[Tables], files: Sequence[str], record: Path) -> st
     figure = (
         f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*"
     )
-    encoders = json.loads((record / ENCODERS_FILE).read_text("utf-8"))["rows"]
-    compared = markdown(refiners.HEADS, refiners.lines(encoders))
+    alike = encoders.section(json.loads((record / ENCODERS_FILE).read_text("utf-8"))["rows"])
     replica = record / REPLICA_FILE
     of_replica = section(json.loads(replica.read_text("utf-8"))) if replica.is_file() else ""
     cited = SETTINGS.format(table=markdown(["setting", "value", "source"], sources.lines()))
@@ -339,7 +321,7 @@ def page(all_tables: Sequence[Tables], files: Sequence[str], record: Path) -> st
         next((text for text in map(curves, all_tables) if text), ""),
         figure,
         of_replica,
-        ENCODERS.format(table=compared),
+        alike,
         cited,
     )
     return "\n\n".join(part.strip() for part in parts if part.strip()) + "\n"

@@ -241,10 +241,14 @@ def outcomes(
 
 def paragraph(claims: Sequence[Claim], cells: dict[str, Row], scenes: Sequence[str]) -> str:
     """Sentences on all claims, by verdict: what holds first."""
-    found = outcomes(claims, cells, scenes)
-    sentences = []
+    return sentences(outcomes(claims, cells, scenes))
+
+
+def sentences(found: Sequence[Outcome]) -> str:
+    """A sentence for each verdict, on the claims that have it: what holds first."""
+    parts = []
     for verdict in Verdict:
         texts = [outcome.text() for outcome in found if outcome.verdict is verdict]
         if texts:
-            sentences.append(f"What {verdict.value}: {'; '.join(texts)}.")
-    return " ".join(sentences)
+            parts.append(f"What {verdict.value}: {'; '.join(texts)}.")
+    return " ".join(parts)
