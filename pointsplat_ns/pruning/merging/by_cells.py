@@ -245,6 +245,8 @@ class _Work:
             prices.append(found["prices"])
         chosen = lowest(prices, min(left - self.k, most_pairs(left, self.settings)))
         merged = sum(int(part.sum()) for part in chosen)
+        if merged == 0 and left > self.k:
+            raise RuntimeError(f"a round found no pair among {left} Gaussians")  # would never end
         return {
             **{f"{cell}": part for cell, part in enumerate(chosen)},
             "left": torch.tensor(left - merged, **INDICES),

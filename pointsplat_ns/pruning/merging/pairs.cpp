@@ -38,6 +38,10 @@ namespace {
 
 constexpr int64_t NEVER = std::numeric_limits<int64_t>::max();
 constexpr double MIN_DIVISOR = 1e-300;
+constexpr float MOST_COST = std::numeric_limits<float>::max();
+
+// NaN compares as false.
+float bounded(float cost) { return cost < MOST_COST ? cost : MOST_COST; }
 
 // A symmetric matrix 3 x 3: xx, xy, xz, yy, yz, zz.
 struct Six {
@@ -149,10 +153,10 @@ void pointsplat_pair_keys(const Matching* task, int64_t* next) {
         for (int64_t i = first; i < last; ++i)
             for (int64_t slot = 0; slot < k; ++slot) {
                 const int64_t at = k * i + slot, j = m.near[at];
-                float cost = m.costs[at];
+                float cost = bounded(m.costs[at]);
                 for (int64_t back = k * j; back < k * (j + 1); ++back)
                     if (m.near[back] == i) {
-                        cost = j > i ? (cost + m.costs[back]) / 2 : std::numeric_limits<float>::infinity();
+                        cost = j > i ? cost / 2 + bounded(m.costs[back]) / 2 : std::numeric_limits<float>::infinity();
                         break;
                     }
                 int32_t bits;

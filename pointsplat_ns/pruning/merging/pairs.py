@@ -110,6 +110,9 @@ replace_pairs_kernel = Function("pointsplat_replace_pairs", ReplacingStruct, INT
 NEVER = torch.iinfo(torch.int64).max
 """Key of an invalid pair."""
 
+MOST_COST = torch.finfo(torch.float32).max
+"""In place of NaN and infinite costs: finite, so that every pair can be merged at last."""
+
 
 def cheapest_pairs(
     near: Tensor,
@@ -125,7 +128,8 @@ def cheapest_pairs(
     Args:
         near: (n, k) int32, neighbour indices of each Gaussian; its own index means none.
         costs: (n, k) float32, at least 0, of merging each with each neighbour. If two are
-            neighbours of each other, the mean of their two costs counts.
+            neighbours of each other, the mean of their two costs counts. NaN and infinite costs
+            are the highest.
         passes: number of passes.
         compiled: False uses torch; True warns if the kernels are missing.
 
@@ -218,19 +222,23 @@ def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
     k = near.shape[1]
     rows = numbers(here.stop - here.start, near.device) + here.start
     slots = numbers(k, near.device)
-    own = costs[here]
+    own = _bounded(costs[here])
     others = near[here]
     me = rows[:, None].int()
     back = near.index_select(0, others.flatten()).view(-1, k, k) == me[:, :, None]
-    theirs = costs.index_select(0, others.flatten()).view(-1, k, k)
+    theirs = _bounded(costs.index_select(0, others.flatten())).view(-1, k, k)
     slot = back.to(torch.uint8).argmax(2, keepdim=True)
-    mean = ((own + theirs.gather(2, slot)[:, :, 0]) / 2).where(others > me, math.inf)
+    mean = (own / 2 + theirs.gather(2, slot)[:, :, 0] / 2).where(others > me, math.inf)
     once = mean.where(back.any(2), own).where(others != me, math.inf).contiguous()
     # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative
     # hashing).
     hashed = ((rows[:, None] * k + slots) * 2654435761) & 0xFFFFFFFF
     key = (once.view(torch.int32).long() << 32) | hashed
     return rows, others.T.contiguous(), key.where(once < math.inf, NEVER).T.contiguous()
+
+
+def _bounded(costs: Tensor) -> Tensor:
+    return costs.nan_to_num(nan=MOST_COST, posinf=MOST_COST)
 
 
 class Round(NamedTuple):

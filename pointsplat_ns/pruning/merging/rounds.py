@@ -301,6 +301,8 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
         first, second, _ = cheapest_pairs(near, costs, settings.matching_passes)
         del near, costs
         give_back_freed_memory()
+        if not len(first):
+            raise RuntimeError(f"a round found no pair among {n} Gaussians")  # would never end
         state, merged = replace_pairs(step.state, first[:most], second[:most], settings)
         return _with_reference(replace(step, state=state, rounds=(*step.rounds, merged)), settings)
 

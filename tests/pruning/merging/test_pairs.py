@@ -160,6 +160,18 @@ def test_pairs_are_the_cheapest_of_both_members_pass_by_pass(n):
         assert torch.equal(prices, prices.sort().values) and prices.dtype == torch.float32
 
 
+@pytest.mark.parametrize("cost", [0.0, 3e38, math.inf, math.nan])
+def test_there_is_a_pair_whatever_the_costs_and_known_costs_come_first(cost):
+    """Else a round would merge nothing, and merging would never end."""
+    near = torch.tensor([[1], [0], [3], [2]], dtype=torch.int32)
+    costs = torch.full((4, 1), cost)
+    first, second, prices = cheapest_pairs(near, costs)
+    assert first.tolist() == [0, 2] or first.tolist() == [2, 0]
+    assert bool(prices.isfinite().all()) and (first + 1).equal(second)
+    costs[2:] = 1.0
+    assert int(cheapest_pairs(near, costs)[0][0]) == (2 if cost else 0)
+
+
 ALL = torch.arange(200)
 
 
