@@ -49,6 +49,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "other_views": dict(view_seed=2),
     "visibility_views_16": dict(visibility_views=16),
     "drawn_100k": dict(max_count_drawn=100_000),
+    "no_blur": dict(blur=0.0),
     "equal_weights": dict(min_visibility=1.0),
     "min_visibility_1e-2": dict(min_visibility=1e-2),
     "neighbours_4": dict(neighbours=4),

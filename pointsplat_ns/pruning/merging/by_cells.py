@@ -34,7 +34,12 @@ from pointsplat_ns.pruning.merging.regrouping import regrouped
 from pointsplat_ns.pruning.merging.rounds import merge, most_pairs
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import Participants, State, initial_state, principal_axes
-from pointsplat_ns.pruning.merging.visibility import drawn_step, views_to_weigh, visibility_weights
+from pointsplat_ns.pruning.merging.visibility import (
+    blurs_that_count,
+    drawn_step,
+    views_to_weigh,
+    visibility_of,
+)
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.ply import PlyRows, header_bytes, ply_bytes, row_table
 from pointsplat_ns.scene.views import Views
@@ -157,6 +162,7 @@ class Overview:
     size: Tensor  # scalar float64, diagonal of the content, scene units
     # [m] float32, visibility weights of every ``step``-th member of all cells, along the curve
     weights: Tensor
+    blurs: Tensor  # [m] float32, their blurs, in units of the squared size; 0 for none
     step: Tensor  # scalar int64
     middle: Tensor  # [3 (d+1)^2] as of principal_axes
     axes: Tensor  # [3 (d+1)^2, C]
@@ -186,15 +192,23 @@ def overview_of(
         report(0.5 * len(parts) / len(cells))
     scene = enlarged(Gaussians.cat(parts), step)
     participants = Participants(scene, torch.arange(len(scene), **INDICES), *content_size(scene))
-    weights = visibility_weights(
+    weights, blurs = visibility_of(
         participants, views, settings, lambda share: report(0.5 + 0.5 * share)
     )
+    blurs = blurs_that_count(participants, blurs)
     if traced:
         weights *= factors_of(*torch.cat(traces, dim=1))
     size = torch.tensor(participants.size, **DOUBLES)
     every = torch.tensor(step, **INDICES)
+    middle, axes = principal_axes(scene, participants.members)
     return Overview(
-        participants.centre, size, weights, every, *principal_axes(scene, participants.members)
+        centre=participants.centre,
+        size=size,
+        weights=weights,
+        blurs=torch.zeros_like(weights) if blurs is None else blurs,
+        step=every,
+        middle=middle,
+        axes=axes,
     )
 
 
@@ -259,8 +273,7 @@ class _Work:
         if number == 0:
             participants = self.participants(cell)
             scratch.make(_sizes(cell), functools.partial(self.size_changes, cell, participants))
-            places = torch.arange(len(participants), **INDICES) + self.cells.starts(self.k)[cell]
-            weights = overview.weights[places // overview.step]
+            weights = overview.weights[self.drawn(cell)]
             state = initial_state(participants, weights, (overview.middle, overview.axes))
             return state, torch.arange(len(state), **INDICES)
         before = scratch.known(_round(number - 1, cell))
@@ -272,9 +285,16 @@ class _Work:
 
     def participants(self, cell: int) -> Participants:
         """The participants of a cell, along the curve."""
+        overview = self.overview
+        blurs = overview.blurs[self.drawn(cell)] if bool(overview.blurs.any()) else None
         return Participants(
-            *self.cells.members(cell, self.k), self.overview.centre, float(self.overview.size)
+            *self.cells.members(cell, self.k), overview.centre, float(overview.size), blurs
         )
+
+    def drawn(self, cell: int) -> Tensor:
+        """For each participant of a cell, (n,), its place in the overview."""
+        first, last = self.cells.starts(self.k)[cell : cell + 2]
+        return torch.arange(first, last, **INDICES) // self.overview.step
 
     def size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
         """Size changes of the parts in this cell, of four parts evenly spread over all cells.

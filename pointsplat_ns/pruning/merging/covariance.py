@@ -95,6 +95,11 @@ def diagonals(six: Tensor) -> Tensor:
     return torch.stack([six[:, 0], six[:, 3], six[:, 5]], dim=1)
 
 
+def widened(six: Tensor, variances: Tensor) -> Tensor:
+    """Covariances (N, 6) plus variances (N,) in every direction."""
+    return six + variances[:, None] * six.new_tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
+
+
 def outer(vector: Tensor) -> Tensor:
     """(N, 6): vector times its transpose, of (N, 3)."""
     x, y, z = vector.unbind(1)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.geometry.transforms import quaternions_of
-from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, eigen, unpack
+from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, eigen, unpack, widened
 from pointsplat_ns.pruning.merging.pairs import Round
 from pointsplat_ns.pruning.merging.settings import MergeSettings
 from pointsplat_ns.pruning.merging.state import Participants, State
@@ -31,7 +31,7 @@ class Groups:
     group: Tensor  # [n] int64, the group of each participant
     shares: Tensor  # [n] float32, share of each participant in its group's mass
     means: Tensor  # [K, 3] float64, scene units
-    cov: Tensor  # [K, 6] float64, squared scene units
+    cov: Tensor  # [K, 6] float64, with blur, squared scene units
     alphas: Tensor  # [K] float64
     counts: Tensor  # [K] int32, number of members
 
@@ -77,7 +77,13 @@ def scene_maker(
     scene = participants.scene
     counts = members.double()
     single = (counts == 1)[:, None]
-    log_scales, quats = _axes(cov, scene.dtype)
+    least = counts.new_full((len(counts),), MIN_DIVISOR)
+    if participants.blurs is not None:
+        blurs = add_rows(torch.zeros_like(least), group, shares.double() * participants.blurs)
+        blurs *= participants.size**2
+        cov = widened(cov, -blurs)
+        least = torch.maximum(least, 1e-6 * blurs)
+    log_scales, quats = _axes(cov, least, scene.dtype)
     del cov
     means = torch.where(single, scene.means[first], means.to(scene.dtype))
     quats = torch.where(single, scene.quats[first], quats)
@@ -130,8 +136,9 @@ def _mean_sh(
     return means[0], means[1]
 
 
-def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Log-scales (n, 3) float64, and quaternions (n, 4) of a dtype, from covariances (n, 6)."""
+def _axes(cov: Tensor, least: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Log-scales (n, 3) float64, and quaternions (n, 4) of a dtype, from covariances (n, 6);
+    variances are at least ``least`` (n,)."""
     scales = cov.new_empty(len(cov), 3)
     quats = cov.new_empty(len(cov), 4, dtype=dtype)
 
@@ -144,7 +151,8 @@ def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
             .sign()[:, None]
         )
         # as in covariances(): rounding leaves nothing of thinner axes
-        variances = torch.maximum(variances, 1e-10 * variances[:, 2:]).clamp_min(MIN_DIVISOR)
+        variances = torch.maximum(variances, 1e-10 * variances[:, 2:])
+        variances = torch.maximum(variances, least[rows, None])
         scales[rows] = 0.5 * variances.log()
         quats[rows] = quaternions_of(axes).to(dtype)
 

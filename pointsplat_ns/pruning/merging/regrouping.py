@@ -26,7 +26,6 @@ from torch import Tensor
 from pointsplat_ns.geometry.neighbours import NearestOf
 from pointsplat_ns.pruning.merging.covariance import (
     MIN_DIVISOR,
-    covariances_of,
     diagonals,
     inverses_and_log_determinants,
     outer,
@@ -38,7 +37,6 @@ from pointsplat_ns.pruning.merging.groups import Groups
 from pointsplat_ns.pruning.merging.pairs import growth
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import Participants, bounded_colours
-from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.kernels import (
     DOUBLE_POINTER,
     FLOAT_POINTER,
@@ -81,23 +79,19 @@ best_groups_kernel = Function("pointsplat_best_groups", ChoiceStruct, INT64_POIN
 
 
 class Members:
-    """n members of groups. Only masses are stored; other properties are recomputed in pieces each
-    time, which saves memory and, with the kernel, takes little time.
+    """The participants as members of groups. Only masses are stored; other properties are
+    recomputed in pieces each time, which saves memory and, with the kernel, takes little time."""
 
-    Args:
-        scene: N Gaussians.
-        rows: (n,) indices of the members in it.
-    """
-
-    def __init__(self, scene: Gaussians, rows: Tensor):
-        self._scene = scene
-        self._rows = rows
+    def __init__(self, participants: Participants):
+        self._participants = participants
+        self._scene = participants.scene
+        self._rows = participants.members
         self.masses = in_pieces(
-            lambda some: (
-                torch.sigmoid(scene.opacities[some, 0].double())
-                * rms_area(covariances_of(scene, some))
+            lambda these: (
+                torch.sigmoid(self._scene.opacities[self._rows[these], 0].double())
+                * rms_area(participants.cov(these))
             ),
-            rows,
+            numbers(len(participants), self._rows.device),
         )
         """Opacity times root mean square area, (n,)."""
 
@@ -110,8 +104,8 @@ class Members:
         return self._scene.means[self._rows[these]].double()
 
     def cov(self, these: slice) -> Tensor:
-        """Covariances (m, 6) float64 of a piece, squared scene units."""
-        return covariances_of(self._scene, self._rows[these])
+        """Covariances (m, 6) float64 of a piece, with blur, squared scene units."""
+        return self._participants.cov(these)
 
     def colours(self, these: slice) -> Tensor:
         """Colours (m, 3) float32 of SH degree 0 of a piece, colour units."""
@@ -153,7 +147,7 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
     alphas = groups.alphas
     areas = areas_of(groups.cov)
     del groups
-    members = Members(participants.scene, participants.members)
+    members = Members(participants)
     count = len(alphas)
     common = group_moments(members, group, count)
     ratios = alphas * areas / common.mass.clamp_min(MIN_DIVISOR)

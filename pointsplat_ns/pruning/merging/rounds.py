@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.geometry.neighbours import import_tree, other_neighbours
+from pointsplat_ns.geometry.neighbours import NearestOf, import_tree, other_neighbours
 from pointsplat_ns.pruning.merging.groups import Groups, best_size_change, scene_maker
 from pointsplat_ns.pruning.merging.pair_cost import pair_costs
 from pointsplat_ns.pruning.merging.pairs import Round, cheapest_pairs, replace_pairs
@@ -48,7 +48,8 @@ class Merged:
     scene: Gaussians
     """K Gaussians in the order of their first members. Those that were not merged are unchanged,
     exact to the bit."""
-    # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
+    # [N] int64, index in ``scene`` of the Gaussian that each was merged into, or, of points that
+    # were selected, is nearest to; -1 if dropped
     assignment: Tensor
     size_change: float = 0.0
     """Added to the log-scales of merged Gaussians; chosen by comparing renders."""
@@ -276,10 +277,12 @@ def first_step(
         give_back_freed_memory()  # of finished threads
         found = None
         weights = torch.ones_like(participants.members, dtype=torch.float32)
+        blurs = None
         if len(participants) > last:
-            found, weights = views_and_weights(
+            found, (weights, blurs) = views_and_weights(
                 participants, views, settings, lambda share: report(0.5 * share)
             )
+        participants = replace(participants, blurs=blurs)
         return _with_reference(
             Step(participants, found, initial_state(participants, weights)), settings
         )
@@ -339,19 +342,35 @@ def _result(step: Step, regroup: bool, settings: MergeSettings) -> Merged:
     reference = step.reference
     with one_thread_each():
         groups = step.groups()
-        size_change = 0.0
         any_merged = groups.any_merged
         if regroup and any_merged and settings.regrouping_rounds > 0:
             groups = regrouped(participants, groups, settings)
         give_back_freed_memory()
         group, make = scene_maker(participants, groups, settings)
         del groups
-        if reference is not None and any_merged:
-            unit = participants.centre, participants.size
-            size_change = best_size_change(
-                lambda change: reference.psnr(in_units(make(change), *unit))
-            )
-        scene = make(size_change)
-    assignment = group.new_full((len(participants.scene),), -1)
-    assignment[participants.members] = group
-    return Merged(scene, assignment, size_change)
+        assignment = group.new_full((len(participants.scene),), -1)
+        assignment[participants.members] = group
+        if reference is None or not any_merged:
+            return Merged(make(0.0), assignment)
+
+        def psnr(scene: Gaussians) -> float:
+            return reference.psnr(in_units(scene, participants.centre, participants.size))
+
+        size_change = best_size_change(lambda change: psnr(make(change)))
+        merged = Merged(make(size_change), assignment, size_change)
+        if regroup and participants.blurs is not None:
+            selected = _selected(participants, len(merged.scene))
+            merged = max(merged, selected, key=lambda one: psnr(one.scene))
+        return merged
+
+
+def _selected(participants: Participants, k: int) -> Merged:
+    """The ``k`` most opaque participants; each other one is assigned to the nearest of them."""
+    scene = participants.scene
+    members = participants.members
+    rows = participants.most_opaque(k)
+    assignment = members.new_full((len(scene),), -1)
+    nearest = NearestOf(scene.means[rows].double(), 1)
+    assignment[members] = nearest(scene.means[members].double())[:, 0].to(members.dtype)
+    assignment[rows] = numbers(k, members.device)  # where several are at one place
+    return Merged(scene[rows], assignment)

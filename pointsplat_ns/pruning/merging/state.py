@@ -11,11 +11,11 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import bulk_cube, curve_keys, unit_cells
-from pointsplat_ns.pruning.merging.covariance import covariances_of
+from pointsplat_ns.pruning.merging.covariance import covariances_of, widened
 from pointsplat_ns.rendering.constants import ALPHA_MIN
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.system.pieces import in_pieces, pieces
-from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.system.tensors import DOUBLES, numbers
 from pointsplat_ns.system.threads import parallel_map
 from pointsplat_ns.view_sampling.content import content_size
 
@@ -38,6 +38,9 @@ class Participants:
     centre: Tensor  # [3] float64, on the CPU, of the scene's content
     size: float
     """Diagonal of the scene's content, scene units."""
+    # [n] float32 in [0, 1], variances that the rasterizer's blur adds, in units of the squared
+    # size; None for scenes that are not mostly blur
+    blurs: Tensor | None = None
 
     @classmethod
     def of(cls, scene: Gaussians, members: Tensor) -> Participants:
@@ -49,6 +52,23 @@ class Participants:
 
     def __len__(self) -> int:
         return len(self.members)
+
+    def cov(self, these: Tensor | slice) -> Tensor:
+        """Covariances (m, 6) float64 of the participants ``these``, widened by their blurs, squared
+        scene units."""
+        cov = covariances_of(self.scene, self.members[these])
+        if self.blurs is None:
+            return cov
+        return widened(cov, self.blurs[these].double() * self.size**2)
+
+    def most_opaque(self, k: int) -> Tensor:
+        """Ascending indices (k,) in the scene of the most opaque participants; of equals, random
+        ones, which are spread over the scene."""
+        generator = torch.Generator().manual_seed(0)
+        order = torch.randperm(len(self), generator=generator).to(self.members.device)
+        rows = self.members[order]
+        opacities = self.scene.opacities[rows, 0]
+        return rows[opacities.argsort(descending=True, stable=True)[:k]].sort().values
 
 
 def drawable(scene: Gaussians, k: int) -> Tensor:
@@ -84,7 +104,8 @@ class State:
     """
 
     means: Tensor  # [n, 3] float32, relative to the centre, in units of the size
-    cov: Tensor  # [n, 6] float32, in units of the squared size, clamped to the range of float32
+    # [n, 6] float32, with blur, in units of the squared size, clamped to the range of float32
+    cov: Tensor
     alphas: Tensor  # [n] float32
     colours: Tensor  # [n, C] float32 on principal axes, colour units
     weights: Tensor  # [n] float32, visibility weight per unit of area
@@ -118,8 +139,8 @@ def initial_state(
             lambda rows: (scene.means[rows].double() - centre) / size, members, 3, dtype=dtype
         ),
         cov=in_pieces(
-            lambda rows: (covariances_of(scene, rows) / size**2).clamp(-1e30, 1e30),
-            members,
+            lambda these: (participants.cov(these) / size**2).clamp(-1e30, 1e30),
+            numbers(len(members), members.device),
             6,
             dtype=dtype,
         ),

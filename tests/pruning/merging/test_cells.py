@@ -82,8 +82,13 @@ def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
     assert same_bits(read[order], scene[wanted])
 
 
+POINTS = box_room(3, 4000)
+POINTS = POINTS.replace(scales=POINTS.scales - 5)
+"""A room of Gaussians narrower than their blur."""
+
+
 @pytest.mark.parametrize(
-    ("scene", "tolerance"), [(box_room(3, 4000), 0.02), (photographed(4000), 0.1)]
+    ("scene", "tolerance"), [(box_room(3, 4000), 0.02), (photographed(4000), 0.1), (POINTS, 0.02)]
 )
 def test_views_and_weights_are_those_of_merging_in_memory(scene, tolerance, tmp_path, monkeypatch):
     """A tolerance for the size of the content, and for the median of traces, both by a sample."""
@@ -91,7 +96,7 @@ def test_views_and_weights_are_those_of_merging_in_memory(scene, tolerance, tmp_
     monkeypatch.setattr(state, "SAMPLED", 1 << 9)
     settings = replace(MERGING, sampled_views=4, min_count_rendered=0, max_count_drawn=600)
     with use_settings(replace(DEFAULT_SETTINGS, sampled_count=900)):
-        _, weights = views_and_weights(
+        _, (weights, blurs) = views_and_weights(
             Participants.of(scene, drawable(scene, 400)), Sampler(scene), settings
         )
         merged(rows_of(scene, tmp_path), 400, 900, tmp_path, settings)
@@ -99,6 +104,9 @@ def test_views_and_weights_are_those_of_merging_in_memory(scene, tolerance, tmp_
     assert torch.allclose(
         overview["weights"].log(), weights[:: int(overview["step"])].log(), atol=tolerance
     )
+    assert (blurs is not None) == (scene is POINTS)
+    blurs = torch.zeros_like(weights) if blurs is None else blurs
+    assert torch.allclose(overview["blurs"], blurs[:: int(overview["step"])], rtol=tolerance)
 
 
 def test_cells_lose_no_more_than_the_whole_and_leave_no_seam(tmp_path):

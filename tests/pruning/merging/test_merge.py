@@ -9,10 +9,16 @@ import torch
 
 from making import cloud, same, splats, views_from_within
 from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.pruning.baselines import opacity_score, random_score
 from pointsplat_ns.pruning.merging import MERGING, Merger, merge, merge_levels
 from pointsplat_ns.pruning.merging.groups import deepened
+from pointsplat_ns.pruning.paper import select
+from pointsplat_ns.rendering import render
+from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes
 from pointsplat_ns.rendering.constants import ALPHA_MAX
 from pointsplat_ns.scene.gaussians import Gaussians
+from pointsplat_ns.scene.views import Views
+from pointsplat_ns.view_sampling.poses import look_at
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -212,3 +218,92 @@ def test_more_than_can_be_drawn_is_an_error():
     scene.means[:10] = math.nan
     with pytest.raises(BudgetError, match="40 of 50"):
         merge(scene, 45)
+
+
+def points(count: int = 3000, log_scale: float = -5.0) -> Gaussians:
+    """The wall of a gradient, as points far below a pixel of any view that shows all of it."""
+    g = torch.Generator().manual_seed(5)
+    across = 2 * torch.rand(count, 2, generator=g) - 1
+    means = torch.cat([across, torch.zeros(count, 1)], dim=1)
+    return splats(means, log_scale, 1.0, torch.stack([across[:, 0], across[:, 1], across[:, 0]], 1))
+
+
+def ahead(distance: float, focal: float = 90.0) -> Views:
+    """Two views along z."""
+    eyes = torch.tensor([[0.0, 0.0, -distance], [0.1 * distance, 0.0, -distance]]).double()
+    K = torch.tensor([[focal, 0.0, 48.0], [0.0, focal, 36.0], [0.0, 0.0, 1.0]]).double()
+    viewmats = look_at(eyes, torch.zeros_like(eyes))
+    return Views(viewmats, K.repeat(2, 1, 1), 96, 72, torch.zeros(3))
+
+
+def test_points_stay_as_bright_as_their_blur_makes_them():
+    """Without blur they have a tenth of the mass, and most of their light is lost."""
+    scene = points()
+    views = ahead(3.0)
+    light = sum(float(render(scene, view).sum()) for view in views)
+    lost = {}
+    for blur in (0.0, 1.0):
+        small = merge(scene, 1000, views=views, settings=replace(MERGING, blur=blur)).scene
+        lost[blur] = abs(1 - sum(float(render(small, view).sum()) for view in views) / light)
+    assert lost[1.0] < 0.25 < lost[0.0], lost
+
+
+def dressed(kind: str) -> Gaussians:
+    """Points that touch in an image, points that do not, or needles; of all opacities."""
+    count = {"dense": 3000, "dust": 300, "needles": 600}[kind]
+    scene = points(count, -9.0)
+    g = torch.Generator().manual_seed(6)
+    scales = scene.scales.clone()
+    scales[:, 0] = -2.5 if kind == "needles" else -9.0
+    return scene.replace(
+        scales=scales,
+        quats=torch.randn(count, 4, generator=g),
+        opacities=(2 * torch.randn(count, 1, generator=g)).clamp_min(-5.0),
+    )
+
+
+@pytest.mark.parametrize("keep", [0.1, 0.3])
+@pytest.mark.parametrize("kind", ["dense", "dust", "needles"])
+def test_points_and_needles_are_no_worse_merged_than_selected(kind, keep):
+    scene = dressed(kind)
+    count = int(keep * len(scene))
+    views = ahead(3.0)
+    reference = RendersOfSizes(scene, [views])
+    selections = (select(score(scene), count) for score in (opacity_score, random_score))
+    selected = max(reference.psnr(scene[rows]) for rows in selections)
+    merged = merge(scene, count, views=views)
+    assert reference.psnr(merged.scene) >= selected - 1e-3  # dB, of rounded units of length
+    assert merged.assignment.unique().tolist() == list(range(count)), "nothing is dropped"
+    if kind == "dust":  # points that do not touch each other are selected
+        rows = scene.opacities[:, 0].topk(count).indices.sort().values
+        assert same(merged.scene, scene[rows])
+        assert merged.assignment[rows].tolist() == list(range(count))
+
+
+@pytest.mark.parametrize("distance", [1e-3, 3.0, 1e3, 1e12])
+@pytest.mark.parametrize("log_scale", [-math.inf, -60.0, -9.0, 0.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_blurs_of_any_size_leave_finite_gaussians(distance, log_scale, dtype):
+    """Beside Gaussians of any size, at one place too, after one level and after several."""
+    scene = points(300, log_scale).to(dtype)
+    scene.means[:100] = 0.5
+    views = ahead(distance)
+    results = [merge(scene, 40, views=views), *merge_levels(scene, [120, 40], views=views)]
+    for merged in results:
+        assert bool(merged.scene.usable().all()) and len(merged.scene) in (40, 120)
+        several = (merged.assignment.bincount() > 1).nonzero()[:, 0]
+        assert bool(merged.scene.scales[several].isfinite().all())
+
+
+def test_a_pair_much_larger_than_its_blur_is_merged_as_without():
+    scene = cloud(200)
+    views = ahead(3.0, focal=1e6)
+    found, wanted = (
+        merge(scene, 150, views=views, settings=replace(MERGING, blur=blur, finish_views=0)).scene
+        for blur in (1.0, 0.0)
+    )
+    # tolerance: blurs are 3e-12 of variances of 0.0025, rounded to float32
+    for name in ("means", "scales", "opacities"):
+        torch.testing.assert_close(
+            getattr(found, name), getattr(wanted, name), rtol=1e-4, atol=1e-4
+        )

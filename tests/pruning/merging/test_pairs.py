@@ -175,14 +175,19 @@ def test_there_is_a_pair_whatever_the_costs_and_known_costs_come_first(cost):
 ALL = torch.arange(200)
 
 
+def members_of(scene: Gaussians, blurs: torch.Tensor | None = None) -> Members:
+    """All 200 Gaussians of a scene, with their blurs."""
+    return Members(Participants(scene, ALL, torch.zeros(3, dtype=torch.float64), 1.0, blurs))
+
+
 def moments_of(scene: Gaussians, group: torch.Tensor, count: int) -> Moments:
     """Moments of groups of all."""
-    return group_moments(Members(scene, ALL), group, count)
+    return group_moments(members_of(scene), group, count)
 
 
 def after(scene: Gaussians, group: torch.Tensor, count: int) -> torch.Tensor:
     """The group that each fits best: the same by kernels and without them."""
-    members = Members(scene, ALL)
+    members = members_of(scene)
     groups = moments_of(scene, group, count)
     found, torchs = (
         best_groups(members, group, groups, compiled=compiled) for compiled in (None, False)
@@ -196,7 +201,7 @@ def test_moments_are_those_of_the_members_and_between_them():
     group = ALL % 7
     assert torch.equal(after(scene, group, 7).unique(), torch.arange(7)), "no group is left empty"
     groups = moments_of(scene, group, 7)
-    masses = Members(scene, ALL).masses
+    masses = members_of(scene).masses
     for number in range(7):
         these = (group == number).nonzero()[:, 0]
         weights = masses[these] / masses[these].sum()

@@ -10,7 +10,12 @@ from making import ball, normal_scene, photographed, splats
 from pointsplat_ns.pruning.merging import MERGING, visibility
 from pointsplat_ns.pruning.merging.groups import best_size_change, top_of_parabola
 from pointsplat_ns.pruning.merging.state import Participants
-from pointsplat_ns.pruning.merging.visibility import covered_per_area, views_and_weights
+from pointsplat_ns.pruning.merging.visibility import (
+    Visibility,
+    views_and_weights,
+    visibility_in,
+    visibility_of,
+)
 from pointsplat_ns.rendering.comparison.sizes import RendersOfSizes
 from pointsplat_ns.scene.gaussians import Gaussians
 from pointsplat_ns.scene.views import Views
@@ -39,7 +44,7 @@ def wall(z: float, rows: int = 32, size: float = 2.0) -> Gaussians:
 
 
 def weights_of(scene: Gaussians, views: Views) -> torch.Tensor:
-    return covered_per_area(scene, torch.arange(len(scene)), views)
+    return visibility_in(scene, torch.arange(len(scene)), views).weights
 
 
 def aside(scene: Gaussians, x: float) -> Gaussians:
@@ -66,7 +71,7 @@ def test_weights_hardly_depend_on_the_size_of_gaussians_even_below_a_pixel():
 def test_an_occluded_gaussian_has_a_small_weight_also_where_some_are_drawn_for_all(max_count):
     scene = Gaussians.cat([wall(-0.5), wall(0.5)])  # alike to the last digit in all else
     participants = Participants.of(scene, torch.arange(len(scene)))
-    _, found = views_and_weights(
+    _, (found, _) = views_and_weights(
         participants, of_origin((0, 0, -4)), replace(MERGING, max_count_drawn=max_count)
     )
     assert found.shape == (len(scene),) and found.dtype == torch.float32
@@ -100,7 +105,9 @@ def test_weights_are_bounded_whatever_the_scene(dtype, case):
 
 def test_traces_count_where_sh_tell_of_photos_and_fog_has_no_views(monkeypatch):
     monkeypatch.setattr(
-        visibility, "covered_per_area", lambda scene, rows, *_: torch.full((len(rows),), 0.5)
+        visibility,
+        "visibility_in",
+        lambda scene, rows, *_: Visibility(torch.full((len(rows),), 0.5)),
     )
     monkeypatch.setattr(
         visibility, "trace_factors", lambda scene, members: torch.full((len(members),), 16.0)
@@ -112,8 +119,59 @@ def test_traces_count_where_sh_tell_of_photos_and_fog_has_no_views(monkeypatch):
     for scene, weight in ((photographed(), 8.0), (ball(500, 0), 0.5), (fog, 1.0)):
         participants = Participants.of(scene, torch.arange(len(scene)))
         with use_settings(all_sure):
-            views, weights = views_and_weights(participants, Sampler(scene, (32, 24)), settings)
+            views, (weights, _) = views_and_weights(
+                participants, Sampler(scene, (32, 24)), settings
+            )
         assert weights.tolist() == [weight] * len(scene) and (views is None) == (scene is fog)
+
+
+def blurs_of(scene: Gaussians, views: Views, **changes: float) -> torch.Tensor | None:
+    """Blurs of all Gaussians, in the order of the scene, squared scene units."""
+    participants = Participants.of(scene, torch.arange(len(scene)))
+    found = visibility_of(participants, views, replace(MERGING, **changes)).blurs
+    if found is None:
+        return None
+    return found[participants.members.argsort()] * participants.size**2
+
+
+def test_blurs_are_the_variance_of_the_rasterizer_at_the_depth_of_each():
+    """0.3 pixels^2 times (z / f)^2; images up to 320 pixels are not subsampled, larger ones are."""
+    scene = Gaussians.cat([aside(wall(0, size=0.9), -0.6), aside(wall(4, size=0.9), 0.6)])
+    near, far = (0.3 * (depth / 64) ** 2 for depth in (4, 8))
+    for width, f in ((64, 64), (1920, 784)):
+        found = blurs_of(scene, of_origin((0, 0, -4), width=width, height=width * 3 // 4))
+        expected = torch.tensor([near, far]).repeat_interleave(1024) * (64 / f) ** 2
+        torch.testing.assert_close(found, expected, rtol=2e-3, atol=0)  # 784 x 588 is rounded
+
+
+def test_blurs_are_the_mean_over_the_pixels_of_views_and_the_median_where_none_is():
+    hidden = aside(wall(0, rows=8), 100.0)
+    scene = Gaussians.cat([wall(0), hidden])
+    views = of_origin((0, 0, -4), (0, 0, -8))
+    found = blurs_of(scene, views)
+    wall_pixels = 4.0  # the wall is four times as many pixels from half the distance
+    expected = 0.3 / 64**2 * (wall_pixels * 4**2 + 8**2) / (wall_pixels + 1)
+    assert float(found[:1024].median()) == pytest.approx(expected, rel=0.03)
+    assert bool((found[1024:] == found[:1024].sort().values[511]).all())
+
+
+def test_no_blur_is_added_to_antialiased_scenes_or_if_it_is_turned_off():
+    views = of_origin((0, 0, -4))
+    scene = wall(0, rows=8)
+    assert blurs_of(scene, views) is not None
+    assert blurs_of(scene.replace(antialiased=True), views) is None
+    assert blurs_of(scene, replace(views, rasterize_mode="antialiased")) is None
+    assert blurs_of(scene, views, blur=0.0) is None
+    torch.testing.assert_close(blurs_of(scene, views, blur=0.5), 0.5 * blurs_of(scene, views))
+
+
+@pytest.mark.parametrize("distance", [1e-3, 1e3, 1e12, 1e30])
+def test_blurs_are_at_most_the_size_of_the_content(distance):
+    """From 1e3 on, a pixel is larger than the scene."""
+    scene = wall(0, rows=8)
+    participants = Participants.of(scene, torch.arange(len(scene)))
+    found = visibility_of(participants, of_origin((0, 0, -distance)), MERGING).blurs
+    assert bool((found <= 1).all()) and bool((found >= 0).all())
 
 
 @pytest.mark.parametrize(
