@@ -32,7 +32,9 @@ PAGE = """# Time beside splat-transform
 
 - A cell has CPU seconds of `pointsplat prune`/of splat-transform `--decimate`, and their ratio. They are of whole
   processes on one thread. The machine was busy: compare ratios.
-- MB: largest memory of both processes at the smallest budget that was measured. Torch's libraries take 540 MB of ours.
+- MB: largest memory of both processes at the smallest budget that was measured. Torch's libraries take 540 MB of ours,
+  and importing torch and the package 2.5 to 3 s.
+- headquarter_garden_843k is the third level of [headquarter_garden](../benchmarks.md#scenes), by its publisher.
 """
 
 
