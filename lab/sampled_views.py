@@ -14,9 +14,11 @@ import tyro
 from matplotlib.patheffects import withStroke
 
 import pointsplat_ns as ps
-from lab.common.printing import start
+from lab.common.printing import save_figure, start
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.system.files import replacing
+from pointsplat_ns.geometry.transforms import camera_positions
+from pointsplat_ns.pruning.merging.covariance import plane_axes
+from pointsplat_ns.view_sampling.sampler import Sampler
 
 VIEWS = 12
 
@@ -46,11 +48,9 @@ def main(target: tyro.conf.Positional[Path] = Path("docs/concepts/sampled.jpg"))
     """
     room = ps.example_room()
     views = ps.sample_views(room, VIEWS, *SIZE)
-    up = torch.stack([-view.viewmat[1, :3] for view in views]).mean(dim=0).double()
-    up = up / up.norm()
-    right = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[up.abs().argmin()])
-    right = right / right.norm()
-    plan = torch.stack([right, torch.linalg.cross(up, right)], dim=1)
+    places = camera_positions(views.viewmats).double()
+    up = Sampler(room).up.direction.double()
+    plan = torch.stack([axis[0] for axis in plane_axes(up[None])], dim=1)
 
     figure = plt.figure(figsize=(12, 4.4), layout="constrained")
     left, others = figure.subfigures(1, 2, width_ratios=(0.36, 0.64))
@@ -58,15 +58,13 @@ def main(target: tyro.conf.Positional[Path] = Path("docs/concepts/sampled.jpg"))
     means = room.means.double()
     heights = means @ up
     shown = (heights < heights.quantile(CEILING)) & (room.alphas > 0.5)
-    colours = (0.5 + SH_C0 * room.features_dc.reshape(len(room), 3)).clamp(0, 1)
-    above.scatter(*(means[shown] @ plan).T, s=0.4, c=colours[shown].numpy())
-    bounds = (means[shown] @ plan).quantile(torch.tensor([0.0, 1.0], dtype=up.dtype), dim=0)
-    length = 0.08 * float((bounds[1] - bounds[0]).max())
+    colours = (0.5 + SH_C0 * room.features_dc).clamp(0, 1)
+    flat = means[shown] @ plan
+    above.scatter(*flat.T, s=0.4, c=colours[shown].numpy())
+    length = 0.08 * float((flat.amax(dim=0) - flat.amin(dim=0)).max())
     for number, (view, axes) in enumerate(zip(views, others.subplots(3, 4).flat, strict=True), 1):
-        matrix = view.viewmat.double()
-        rotation, translation = matrix[:3, :3], matrix[:3, 3]
-        place = (-rotation.T @ translation) @ plan
-        ahead = rotation[2] @ plan
+        place = places[number - 1] @ plan
+        ahead = view.viewmat[2, :3].double() @ plan
         ahead = length * ahead / ahead.norm()
         above.arrow(*place, *ahead, width=0.06 * length, color=RED, length_includes_head=True)
         aside = 0.4 * (number % 5 - 2) * torch.stack([-ahead[1], ahead[0]])  # apart from others
@@ -77,10 +75,7 @@ def main(target: tyro.conf.Positional[Path] = Path("docs/concepts/sampled.jpg"))
     above.set_title("the room from above, and twelve cameras", fontsize=11)
     above.set_aspect("equal")
     above.set_axis_off()
-    with replacing(target) as part:
-        figure.savefig(part, format="jpg", dpi=100, pil_kwargs={"quality": 88})
-    plt.close(figure)
-    print(target)
+    save_figure(figure, target, dpi=100, pil_kwargs={"quality": 88})
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,6 +71,11 @@ def put_between(text: str, new: str, path: Path, name: str) -> str:
         raise SystemExit(f"{path}: expected {first} and then {last}, once each")
     before, rest = text.split(first)
     return f"{before}{first}\n\n{new}\n\n{last}{rest.split(last)[1]}"
+
+
+def wrapped(text: str) -> str:
+    """A paragraph of a page in lines of at most 120 characters."""
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def number(digits: int, scale: float = 1.0, sign: str = "") -> Callable[[float | None], str]:

@@ -9,13 +9,13 @@ Refiners are named after the rows of :mod:`lab.tables.ways`, and each name has o
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
-from statistics import fmean, stdev
+from statistics import fmean
 
-from lab.common.printing import markdown
+from lab.common.printing import markdown, wrapped
 from lab.common.results import Row, grouped
 from lab.judge.captures import CAPTURES
+from lab.judge.refiners import gain, mean_and_spread
 from lab.tables.findings import CLAIMS, Claim, Outcome, sentences
 from lab.tables.ways import WAYS, Way
 
@@ -62,7 +62,7 @@ STEPS = 600
 def gains(rows: Sequence[Row], name: str) -> dict[str, float]:
     """What the refiners of a name gain in each scene, dB; means over seeds."""
     mine = grouped((row for row in rows if row["method"] == name), lambda row: row["scene"])
-    return {scene: fmean(map(_gain, of_scene)) for scene, of_scene in mine.items()}
+    return {scene: fmean(map(gain, of_scene)) for scene, of_scene in mine.items()}
 
 
 def verdicts(rows: Sequence[Row]) -> list[Outcome]:
@@ -88,20 +88,10 @@ def lines(rows: Sequence[Row]) -> list[list[str]]:
         kinds = grouped(mine, lambda row: "captures" if row["scene"] in CAPTURES else "splats")
         for kind, of_kind in kinds.items():
             by_scene = gains(of_kind, name)
-            by_seed = [
-                fmean(map(_gain, of_seed))
-                for of_seed in grouped(of_kind, lambda row: row["number"]).values()
-            ]
             worst = min(by_scene, key=by_scene.__getitem__)
-            found.append(
-                [
-                    label,
-                    f"{len(by_scene)} {kind}",
-                    f"{fmean(by_seed):+.2f}",
-                    f"{stdev(by_seed):.2f}" if len(by_seed) > 1 else "-",
-                    f"{by_scene[worst]:+.2f} ({worst})",
-                ]
-            )
+            scenes = f"{len(by_scene)} {kind}"
+            least = f"{by_scene[worst]:+.2f} ({worst})"
+            found.append([label, scenes, *mean_and_spread(of_kind), least])
     return found
 
 
@@ -111,14 +101,8 @@ def section(rows: Sequence[Row]) -> str:
         len(same) for same in grouped(rows, lambda row: (row["method"], row["scene"])).values()
     }
     return SECTION.format(
-        finding=textwrap.fill(
-            sentences(verdicts(rows)), 120, break_long_words=False, break_on_hyphens=False
-        ),
+        finding=wrapped(sentences(verdicts(rows))),
         seeds=" or ".join(map(str, sorted(seeds))),
         steps=STEPS,
         table=markdown(HEADS, lines(rows)),
     )
-
-
-def _gain(row: Row) -> float:
-    return float(row["psnr"] - row["pruned_psnr"])

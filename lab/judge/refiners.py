@@ -36,6 +36,19 @@ def named(text: str) -> tuple[str, str]:
     return name, path
 
 
+def gain(row: Row) -> float:
+    """What the refiner of a row gains over the pruned scene, dB."""
+    return float(row["psnr"] - row["pruned_psnr"])
+
+
+def mean_and_spread(rows: Iterable[Row]) -> tuple[str, str]:
+    """Cells of the mean of the gains of refiners over scenes, and of its standard deviation from
+    refiner to refiner."""
+    one_each = grouped(rows, lambda row: row["number"]).values()
+    gains = [fmean(map(gain, of_one)) for of_one in one_each]
+    return f"{fmean(gains):+.2f}", f"{stdev(gains):.2f}" if len(gains) > 1 else "-"
+
+
 def lines(rows: Iterable[Row]) -> list[list[str]]:
     """Cells of :data:`HEADS` for each name, selection and budget: the number of refiners of the
     name, the mean of their gains over scenes, and the standard deviation of these means from
@@ -43,10 +56,8 @@ def lines(rows: Iterable[Row]) -> list[list[str]]:
     found = []
     groups = grouped(rows, lambda row: (row["method"], row["by"], row["keep"]))
     for (name, by, keep), members in groups.items():
-        one_each = grouped(members, lambda row: row["number"]).values()
-        gains = [fmean(row["psnr"] - row["pruned_psnr"] for row in of_one) for of_one in one_each]
-        spread = f"{stdev(gains):.2f}" if len(gains) > 1 else "-"
-        found.append([name, by, percent(keep), str(len(gains)), f"{fmean(gains):+.2f}", spread])
+        trainings = len({row["number"] for row in members})
+        found.append([name, by, percent(keep), str(trainings), *mean_and_spread(members)])
     return found
 
 

@@ -21,7 +21,7 @@ from statistics import fmean
 
 import tyro
 
-from lab.common.printing import markdown, number, put_between, start
+from lab.common.printing import markdown, number, put_between, start, wrapped
 from lab.common.results import Row
 from lab.judge import encoders
 from lab.judge.record import FOLDER, ROOT
@@ -176,7 +176,7 @@ def findings(all_tables: Sequence[Tables]) -> str:
             left[kind] = [claim for claim in left[kind] if not measured[claim]]
             if shown:
                 parts.append(
-                    _wrapped(f"**{head}** {escaped(paragraph(shown, tables.cells, names))}")
+                    wrapped(f"**{head}** {escaped(paragraph(shown, tables.cells, names))}")
                 )
     return "\n\n".join(parts)
 
@@ -259,11 +259,6 @@ def times(all_tables: Sequence[Tables]) -> str:
                 lines.append([_name(way), made, seconds(fmean(judged)) if judged else "-", in_size])
                 break
     return markdown(["row, 10 %", "s to make", "s to judge", "in"], lines)
-
-
-def _wrapped(text: str) -> str:
-    """A paragraph in lines of at most 120 characters."""
-    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def _name(way: Way) -> str:

@@ -32,8 +32,8 @@ PAGE = """# Time beside splat-transform
 
 - A cell has CPU seconds of `pointsplat prune`/of splat-transform `--decimate`, and their ratio. They are of whole
   processes on one thread. The machine was busy: compare ratios.
-- MB: largest memory of both processes at the smallest budget that was measured. Torch's libraries take 540 MB of ours,
-  and importing torch and the package 2.5 to 3 s.
+- MB: largest memory of both processes at the smallest budget that was measured. Torch's libraries take 540 MB of ours.
+- Importing torch and the package takes 2.5 to 3 of our seconds.
 - headquarter_garden_843k is the third level of [headquarter_garden](../benchmarks.md#scenes), by its publisher.
 """
 

@@ -59,6 +59,11 @@ def invert_rigid(matrices: Tensor) -> Tensor:
     return torch.cat([torch.cat([rotation, translation], dim=2), last_row], dim=1)
 
 
+def camera_positions(viewmats: Tensor) -> Tensor:
+    """Positions (C, 3) of the cameras of world-to-camera matrices (C, 4, 4). Differentiable."""
+    return invert_rigid(viewmats)[:, :3, 3]
+
+
 def viewmats_from_opengl(camera_to_worlds: Tensor) -> Tensor:
     """World-to-camera matrices (C, 4, 4) with OpenCV axes, for rasterizers, from nerfstudio's
     camera-to-world matrices (C, 3, 4) with OpenGL axes. Differentiable."""

@@ -24,7 +24,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.neighbours import nearest
-from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.geometry.transforms import camera_positions
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS, ViewProvider
 from pointsplat_ns.rendering import pixel_sums, pixels_of, render, render_depth
 from pointsplat_ns.rendering.comparison.closeness import DenseReference
@@ -304,7 +304,7 @@ def _views_all_around(scene: Gaussians) -> Views:
     without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
     # Few of the likeliest views are behind walls. Views for comparisons use another seed.
     views = Sampler(without_sh).views(PLACES, seed=17, likeliest=True)
-    places = invert_rigid(views.viewmats)[:, :3, 3]
+    places = camera_positions(views.viewmats)
     forward = torch.cat([torch.eye(3, **DOUBLES), -torch.eye(3, **DOUBLES)])
     right = forward.roll(1, dims=1)
     down = torch.linalg.cross(forward, right)

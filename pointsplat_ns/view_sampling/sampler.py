@@ -35,7 +35,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.geometry.transforms import curve_keys, invert_rigid, unit_cells
+from pointsplat_ns.geometry.transforms import camera_positions, curve_keys, unit_cells
 from pointsplat_ns.rendering import pixels_of_each
 from pointsplat_ns.rendering.comparison.sizes import RESOLUTION
 from pointsplat_ns.scene.gaussians import Gaussians
@@ -69,11 +69,6 @@ class Candidates:
     likelihoods: Tensor  # [C] float64, logarithms up to a constant
     shown: Tensor  # [C, n] bool, of the Gaussians Sampler.few
     enclosure: Tensor  # [C] float64 in (0, 1]
-
-    @property
-    def eyes(self) -> Tensor:
-        """Positions (C, 3) of the cameras."""
-        return invert_rigid(self.viewmats)[:, :3, 3]
 
     def within_walls(self) -> Tensor:
         """Log-likelihoods (C,), of which those beyond the walls of a closed room are -infinity."""
@@ -279,14 +274,14 @@ class Sampler:
     def _candidates(self, viewmats: Tensor) -> Candidates:
         """The candidates of world-to-camera matrices (C, 4, 4)."""
         likelihoods, shown = self.judged(views_of(viewmats, *self.resolution, UNITS))
-        eyes = invert_rigid(viewmats)[:, :3, 3]
-        return Candidates(viewmats, likelihoods, shown, enclosures(self._some_points, eyes))
+        enclosure = enclosures(self._some_points, camera_positions(viewmats))
+        return Candidates(viewmats, likelihoods, shown, enclosure)
 
     def judged(self, views: Views) -> tuple[Tensor, Tensor]:
         """Log-likelihoods (V,) of views in units of the content, up to a constant, float64, and a
         mask (V, n) of the Gaussians :attr:`few` that each view shows."""
         viewmats = views.viewmats.double()
-        eyes = invert_rigid(viewmats)[:, :3, 3]
+        eyes = camera_positions(viewmats)
         small = replace(
             views.resized(current_settings().candidate_side), rasterize_mode="antialiased"
         )
@@ -380,7 +375,7 @@ class Sampler:
         exponent = current_settings().likely_share_exponent
         shares = (exponent * candidates.within_walls()).softmax(dim=0)
         drawn = torch.multinomial(shares, count, replacement=True, generator=generator)
-        return self._around(candidates.eyes[drawn], generator)
+        return self._around(camera_positions(candidates.viewmats)[drawn], generator)
 
     def _around(self, places: Tensor, generator: torch.Generator) -> Tensor:
         """Cameras (C, 4, 4) near places (C, 3), above the floor, that look at random Gaussians."""

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.geometry.transforms import camera_positions
 from pointsplat_ns.pipeline.view_provider import VIEW_COUNTS
 from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.scene.formats.spz import encode_spz
@@ -93,7 +93,7 @@ class FlightFrame:
         sizes = self.views.size_of_each()
         longer = self.views.Ks.new_tensor([max(size.width, size.height) for size in sizes])
         fov = 2 * torch.atan(0.5 * longer / self.views.Ks[:, 0, 0].abs())
-        eyes = invert_rigid(self.views.viewmats)[:, :3, 3]
+        eyes = camera_positions(self.views.viewmats)
         return {
             "scenes": list(packed),
             "views": [
